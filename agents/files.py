@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from itertools import zip_longest
@@ -29,15 +28,10 @@ LANE_CHANGING = "idm+mobil"
 """The same with lane changes by MOBIL; a driver of the traffic."""
 HUMAN = "human"
 """An attentive human driver by a published model."""
-VISION = "vision"
-"""The shipped ego with a camera."""
-SHIPPED_EGOS = ("imitation",)
-"""Shipped drivers that were trained to be egos: by their mean actions they keep lane and distance, see docs/egos.md."""
-SHIPPED_DRIVERS = ("mgail", "gail")
-"""Shipped drivers of the traffic."""
-SHIPPED = Path(__file__).parent / "data"
-"""Folder of the shipped files."""
-SUFFIX = ".safetensors"
+VISION, SHIPPED_EGOS, SHIPPED_DRIVERS = "vision", ("imitation",), ("mgail", "gail")
+"""Shipped networks: the ego with a camera, drivers that were trained to be egos, drivers of the traffic."""
+SHIPPED, SUFFIX = Path(__file__).parent / "data", ".safetensors"
+"""Folder of the shipped files, and how files of networks end."""
 DRIVER_ENTRY, VISION_ENTRY = "driver", "vision"
 """A header's one entry: several would be written in no fixed order, and equal drivers not as equal bytes."""
 
@@ -151,8 +145,7 @@ def check_form(header: Mapping[str, Any], form: Mapping[str, Any], path: Path) -
         if theirs != ours:
             if isinstance(theirs, list) and isinstance(ours, list):
                 theirs, ours = next((a, b) for a, b in zip_longest(theirs, ours) if a != b)
-            told = f"{name} {reprlib.repr(theirs)} where this version reads {reprlib.repr(ours)}"
-            raise ValueError(f"{str(path)!r} has {told}.")
+            raise ValueError(f"{str(path)!r} has {name} {theirs!r:.50} where this version reads {ours!r:.50}.")
 
 
 def read_network(make: Callable[[], Network], tensors: Mapping[str, Tensor], path: Path, prefix: str = "") -> Network:
@@ -162,7 +155,10 @@ def read_network(make: Callable[[], Network], tensors: Mapping[str, Tensor], pat
     expected = {prefix + name: value for name, value in network.state_dict().items()}
     require(tensors, expected, path)
     for name, value in expected.items():
-        check_tensor(name, tensors[name], tuple(value.shape), torch.float32, path)
+        shape, own = tuple(tensors[name].shape), tensors[name].dtype
+        if (shape, own) != (tuple(value.shape), value.dtype):
+            wanted = f"shape {tuple(value.shape)} and {value.dtype}"
+            raise ValueError(f"{str(path)!r}: expected {name} of {wanted}, got {shape} and {own}.")
     network.load_state_dict({name.removeprefix(prefix): tensors[name] for name in expected}, assign=True)
     return network.eval().requires_grad_(False)
 
@@ -172,14 +168,6 @@ def require(present: Mapping[str, Any], names: Iterable[str], path: Path) -> Non
     missing = [name for name in names if name not in present]
     if missing:
         raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}; save the driver again with agents.save_driver.")
-
-
-def check_tensor(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype, path: Path) -> None:
-    """Refuse a tensor of another shape or type."""
-    if tuple(value.shape) != shape or value.dtype != dtype:
-        raise ValueError(
-            f"{str(path)!r}: expected {name} of shape {shape} and {dtype}, got {tuple(value.shape)} and {value.dtype}."
-        )
 
 
 def _check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:

@@ -64,12 +64,10 @@ class OnnxEgo:
         self.path = path
         self._inputs, self._outputs = self._session.get_inputs(), self._session.get_outputs()
         if not self._inputs or len(self._inputs) != len(self._outputs):
-            inputs, outputs = (
-                ", ".join(port.name for port in ports) or "none" for ports in (self._inputs, self._outputs)
-            )
+            got = " and ".join(str([port.name for port in ports]) for ports in (self._inputs, self._outputs))
             raise ValueError(
                 f"Expected {str(path)!r} to have one input (observations) and one output (actions), and after them a "
-                f"memory, as many inputs as outputs; got inputs {inputs} and outputs {outputs}."
+                f"memory, as many inputs as outputs; got {got}."
             )
         for port in self._inputs:
             if port.type not in _TYPES or not port.shape or any(not isinstance(size, int) for size in port.shape[1:]):
@@ -77,13 +75,9 @@ class OnnxEgo:
                     f"Expected input {port.name!r} of {str(path)!r} to be float or double of shape "
                     f"(batch, fixed sizes), got {port.type} {port.shape}."
                 )
-        batch = self._inputs[0].shape[0]
+        batch, *shape = self._inputs[0].shape
         self.fixed_batch: int | None = batch if isinstance(batch, int) else None
-
-    @property
-    def observation_space(self) -> spaces.Box:
-        """Space of one observation; without bounds, which the file does not tell."""
-        return spaces.Box(-np.inf, np.inf, tuple(self._inputs[0].shape[1:]), np.float32)
+        self.observation_space = spaces.Box(-np.inf, np.inf, tuple(shape), np.float32)  # the file tells no bounds
 
     @cached_property
     def action_space(self) -> spaces.Space[Any] | None:
@@ -106,11 +100,9 @@ class OnnxEgo:
     ) -> tuple[NDArray[Any], Any]:
         """Choose an action for each row of a batch; see `agents.Ego.predict`. The graph is always deterministic."""
         observation = np.asarray(observation)
-        if state is None:
-            shapes = ((len(observation), *port.shape[1:]) for port in self._inputs[1:])
-            memory = [np.zeros(shape) for shape in shapes]
-        else:
-            memory = list(state)
+        memory = (
+            [np.zeros((len(observation), *port.shape[1:])) for port in self._inputs[1:]] if state is None else state
+        )
         if state is not None and episode_start is not None and np.any(episode_start):
             anew = np.asarray(episode_start, dtype=bool)
             memory = [np.where(anew.reshape(-1, *[1] * (part.ndim - 1)), 0, part) for part in memory]

@@ -186,7 +186,7 @@ class _Maker:
             return {key: self.make(one) for key, one in value.items()}
         if type(value) in (list, tuple):
             return type(value)(map(self.make, value))
-        if isinstance(value, type):
+        if isinstance(value, type) and issubclass(value, _Note):
             return _find_class(value.name, REFERRED_BASES)
         if not isinstance(value, _Note):
             return value

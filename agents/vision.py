@@ -30,10 +30,8 @@ if TYPE_CHECKING:
 
 HEIGHT, WIDTH = 66, 200
 """Height and width of the pictures [pixels]."""
-OUTPUT_SIZE = 2
-"""Acceleration and yaw rate."""
-PILOTNET_HIDDEN_UNITS = 50
-"""Units of the layer that `PilotNet.hidden` gives."""
+PILOTNET_HIDDEN_UNITS, OUTPUT_SIZE = 50, 2
+"""Units of the layer that `PilotNet.hidden` gives; acceleration and yaw rate."""
 ACCELERATION_UNIT, TURN_UNIT = 2.0, 0.1
 """Outputs are in these units [m/s^2, rad/s]."""
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
@@ -55,10 +53,7 @@ _FORM: Mapping[str, Any] = {"format": 1, "observation": OBSERVATION, "picture": 
 
 
 def luma(picture: Tensor) -> Tensor:
-    """Return the brightness (B, H, W) of pictures (B, H, W, 3), uint8: the coefficients of `YUV` times 256, rounded.
-
-    It is computed in integers, so that the bits are the same whatever the batch.
-    """
+    """Return the brightness (B, H, W) of pictures (B, H, W, 3), in integers, whose bits depend on no batch."""
     red, green, blue = picture.to(torch.int32).unbind(-1)
     return ((77 * red + 150 * green + 29 * blue + 128) >> 8).to(torch.uint8)
 
@@ -148,12 +143,7 @@ class VisionEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return actions in [-1, 1] (B, 2), and the luma of the last pictures (B, 5, 66, 200), the oldest first.
-
-        The observation has "camera", uint8 (B, 66, 200, 3), and "speed" (B, 1). Rows that begin an episode remember the
-        present picture only. It is always deterministic.
-        """
-        del deterministic
+        """Return actions in [-1, 1] (B, 2), and the luma of the last pictures (B, 5, 66, 200), the oldest first."""
         picture, speed = _read_observation(observation)
         earlier, state = update_memory(picture, state, episode_start)
         outputs = self.network(picture, torch.from_numpy(earlier), speed)
@@ -163,9 +153,9 @@ class VisionEgo:
 def update_memory(
     picture: Tensor, state: NDArray[np.uint8] | None, episode_start: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the luma of `LAG` pictures ago (B, H, W), and the memory (B, LAG, H, W) with a picture (B, H, W, 3) added.
+    """Return the luma of `LAG` pictures ago (B, H, W), and the memory (B, LAG, H, W) with a picture added.
 
-    The whole memory of rows that begin an episode is this picture.
+    The whole memory of rows that begin an episode is this picture (B, H, W, 3).
     """
     now = luma(picture).numpy()
     start = np.full(len(now), state is None)

@@ -75,7 +75,7 @@ class LearnedDriver:
         >>> from agents import load_driver
         >>> driver = load_driver("mgail")
         >>> driver.weights
-        WeightDistribution(404 weights, radius=0.01)
+        WeightDistribution(radius=0.01)
         >>> action, memory = driver.act(torch.zeros(4, 6, 51))
         >>> tuple(action.shape), memory
         ((4, 6, 2), None)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -70,11 +70,7 @@ class Policy(nn.Module):
     """
 
     def __init__(self, scaling: Scaling, log_std_cap: float = 0.0) -> None:
-        """Start with small heads, and a log standard deviation of about -1.3.
-
-        Log standard deviations approach their cap smoothly from below: a hard cap would have no gradient beyond it,
-        and leave half of the last layer's weights without effect.
-        """
+        """Start with small heads; log standard deviations, at first about -1.3, approach their cap from below."""
         super().__init__()
         self.log_std_cap: Tensor
         self.register_buffer("log_std_cap", torch.tensor(float(log_std_cap)))
@@ -198,9 +194,9 @@ class WeightDistribution:
     Cross-entropy takes it as a block as it is: `mean`, `covariance` and `radius` say what it is and how it may move.
     """
 
-    mean: FloatArray
+    mean: FloatArray = field(repr=False)
     """Shape (d,)."""
-    precision: FloatArray
+    precision: FloatArray = field(repr=False)
     """Inverse covariance, shape (d, d); mostly zeros when a graphical lasso made it."""
     radius: float = RADIUS
     """A search keeps |mu - mean|_inf within this."""
@@ -219,9 +215,6 @@ class WeightDistribution:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         self._whitening  # noqa: B018 - positive definite, or an error now rather than at the first draw
-
-    def __repr__(self) -> str:
-        return f"WeightDistribution({self.dim} weights, radius={self.radius:g})"
 
     @property
     def dim(self) -> int:

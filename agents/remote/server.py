@@ -191,10 +191,7 @@ def _measure_bytes(memory: Any) -> int:
 
 
 class EgoServer(contextlib.AbstractContextManager["EgoServer"]):
-    """Answers requests for an ego, one after the other; docs/egos.md has the messages.
-
-    Attributes:
-        address: Where it listens, the port filled in.
+    """Answers requests for an ego, one after the other, at `address`; docs/egos.md has the messages.
 
     Example:
         >>> import agents
@@ -212,17 +209,10 @@ class EgoServer(contextlib.AbstractContextManager["EgoServer"]):
     def __init__(
         self, ego: Any, bind: str = "tcp://127.0.0.1:5555", secret: bytes | None = None, name: str = "ego"
     ) -> None:
-        """Begin to listen.
+        """Begin to listen for an ego, an object with `predict`, whose name clients are told.
 
-        Args:
-            ego: Has `predict`.
-            bind: Address; "tcp://127.0.0.1:*" takes a free port.
-            secret: Shared with clients: with it connections are encrypted, and others are refused. Needed unless the
-                address is a loopback one.
-            name: Name of the ego, which clients are told.
-
-        Raises:
-            ValueError: The address cannot be used, or needs a secret.
+        With a secret, which all addresses but loopback ones need, connections are encrypted and those without it are
+        refused. A ValueError says that the address cannot be used, or needs a secret.
         """
         if not is_loopback(bind) and not secret:
             raise ValueError(
@@ -253,22 +243,18 @@ class EgoServer(contextlib.AbstractContextManager["EgoServer"]):
         """End `run` from another thread."""
         self._stop.set()
 
-    def close(self) -> None:
+    def close(self, *_: object) -> None:
         """Stop listening."""
         self._context.destroy(0)
 
-    def __exit__(self, *_: object) -> None:
-        """Stop listening."""
-        self.close()
+    __exit__ = close
 
 
 def _make_router(context: zmq.Context[Socket]) -> Socket:
     """Return a socket for requests, of bounded messages and queues."""
-    router = context.socket(zmq.ROUTER)
-    router.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
-    router.setsockopt(zmq.LINGER, 0)
-    router.setsockopt(zmq.RCVHWM, _QUEUED_MESSAGES)
-    router.setsockopt(zmq.SNDHWM, _QUEUED_MESSAGES)
+    router, bounds = context.socket(zmq.ROUTER), {zmq.MAXMSGSIZE: protocol.MAX_BYTES, zmq.LINGER: 0}
+    for option, value in (bounds | dict.fromkeys((zmq.RCVHWM, zmq.SNDHWM), _QUEUED_MESSAGES)).items():
+        router.setsockopt(option, value)
     return router
 
 

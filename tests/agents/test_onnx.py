@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
@@ -19,24 +18,12 @@ from torch import nn
 import rare_envs
 from agents import load_ego
 from agents.onnx import ACTION_TOLERANCE, compare_actions, export_onnx
+from tests.agents.sb3.test_saved_ego import Still
 
 pytest.importorskip("onnx", reason="the extra onnx is optional")
 pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
 ENV = "rare_envs/CarFollowing-v0"
-
-
-class Still(gym.Env[np.ndarray, Any]):
-    def __init__(self, action_space: spaces.Space[Any]) -> None:
-        self.observation_space = spaces.Box(-5.0, 5.0, (7,), np.float32)
-        self.action_space = action_space
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        return self.np_random.normal(3.0, 2.0, 7).astype(np.float32), {}
-
-    def step(self, action: Any) -> Any:
-        return self.np_random.normal(3.0, 2.0, 7).astype(np.float32), 0.0, False, False, {}
 
 
 def vec_env(action_space: spaces.Space[Any] | None = None) -> DummyVecEnv:

@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import rare_envs
 import training
@@ -127,31 +127,6 @@ def test_attributes_and_methods_are_those_of_the_batch() -> None:
 
 
 # --- our environments --------------------------------------------------------------------------
-
-
-def test_our_environments_behave_as_a_vec_env() -> None:
-    env = sb3_vec_env(CUT_IN, 8, seed=1)
-    rng = np.random.default_rng(0)
-    assert isinstance(env, VecMonitor)
-    observation: Any = env.reset()
-    ended = 0
-    for _ in range(300):
-        assert observation.shape == (8, *env.observation_space.shape)  # type: ignore[misc]
-        assert observation.dtype == env.observation_space.dtype
-        assert all(env.observation_space.contains(row) for row in observation)
-        actions = rng.uniform(-1.0, 1.0, (8, 2)).astype(np.float32)
-        observation, reward, done, infos = env.step(actions)
-        assert reward.dtype == np.float32
-        assert np.isfinite(reward).all()
-        for row in range(8):
-            assert ("terminal_observation" in infos[row]) == done[row]
-        for row in np.flatnonzero(done):
-            ended += 1
-            info = infos[row]
-            assert env.observation_space.contains(info["terminal_observation"])
-            assert info["TimeLimit.truncated"] == (not info["collision"])
-            assert (info["measure"] < 0) == info["collision"]
-    assert ended > 16
 
 
 def test_reset_options_reach_our_environments() -> None:

@@ -29,8 +29,7 @@ from training.data.table import DT
 from training.imitation.traffic import Recording, Traffic, lane_of, replay_features, start_replay, step_replay
 
 Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
-"""Function from features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new
-memory."""
+"""From features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new memory."""
 HARD_BRAKE_ACCELERATION = -3.0
 """Acceleration [m/s^2] from which on a brake is hard."""
 ERROR_TIME = 5.0
@@ -194,36 +193,35 @@ def current_errors(recording: Recording, traffic: Traffic) -> Errors:
 
 
 class DrivingStatistics(NamedTuple):
-    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow.
-
-    Numbers of vehicle-steps and of vehicles, (S,) each; sums of hard braking, collision, off-road, lane changes and
-    speed by vehicle-step, and of `ever` by vehicle; histograms (S, bins); squared errors of position [m^2], speed and
-    lateral position after 5 s, and their number.
-    """
+    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow."""
 
     steps: FloatArray
+    """Vehicle-steps (S,)."""
     vehicles: FloatArray
+    """Likewise."""
     sums: dict[str, FloatArray]
+    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, and `ever` by vehicle, (S,) each."""
     counts: dict[str, FloatArray]
+    """Histograms (S, bins)."""
     squared: dict[str, FloatArray]
+    """Errors after 5 s: position [m^2], speed and lateral position, and their number, (S,) each."""
 
 
 def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the values of each quantity in `BINS` with their scenes, shape (k,) each."""
-    known = behaviour.known
-    both = known[1:] & known[:-1]
-    meets = known & (behaviour.ahead < MAX_RANGE)
+    known, ahead = behaviour.known, behaviour.ahead
     scene = behaviour.scene.expand_as(known)
     jerk = (behaviour.acceleration[1:] - behaviour.acceleration[:-1]) / DT
-    inverse_ttc = -behaviour.rate / behaviour.ahead.clamp(min=LEAST_RANGE)
-    return {
-        "speed": (behaviour.speed[known], scene[known]),
-        "acceleration": (behaviour.acceleration[known], scene[known]),
-        "jerk": (jerk[both], scene[1:][both]),
-        "yaw_rate": (behaviour.yaw_rate[known], scene[known]),
-        "inverse_ttc": (inverse_ttc[meets], scene[meets]),
-        "gap": (behaviour.ahead[known], scene[known]),
+    inverse_ttc = -behaviour.rate / ahead.clamp(min=LEAST_RANGE)
+    quantities = {
+        "speed": (behaviour.speed, known),
+        "acceleration": (behaviour.acceleration, known),
+        "jerk": (jerk, known[1:] & known[:-1]),
+        "yaw_rate": (behaviour.yaw_rate, known),
+        "inverse_ttc": (inverse_ttc, known & (ahead < MAX_RANGE)),
+        "gap": (ahead, known),
     }
+    return {name: (values[where], scene[-len(where) :][where]) for name, (values, where) in quantities.items()}
 
 
 def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> DrivingStatistics:

@@ -1,14 +1,9 @@
 """GAIL and MGAIL: behaviour cloning, from which both start, the critic, their updates, the state of a training.
 
-Cloning maximises the likelihood of recorded actions. The critic is a network that tells recorded driving from a
-policy's, by the features and the action of one moment.
-
-MGAIL follows the gradient of its costs through the simulator. Baram et al. learn a forward model, because their
-simulator has no gradient; ours has one, so nothing is approximated.
-
-GAIL follows rewards by proximal policy optimisation; all vehicles share its parameters. The reward of a moment is minus
-the costs that MGAIL descends: the critic's, and the penalties (reward augmentation, Bhattacharyya et al. 2019). As
-there, the gradient of the likelihood of recorded actions is added.
+The critic tells recorded driving from a policy's, by the features and the action of one moment. MGAIL follows the
+gradient of its costs through the simulator, which needs no forward model. GAIL follows rewards, minus the same costs
+(reward augmentation, Bhattacharyya et al. 2019), by proximal policy optimisation with parameters that all vehicles
+share; the gradient of the likelihood of recorded actions is added.
 
 References:
     Baram, Anschel, Caspi and Mannor, "End-to-end differentiable adversarial imitation learning", ICML 2017. Ho and
@@ -178,11 +173,9 @@ class Learner:
 
     def set_rates(self) -> None:
         """Set the learning rates of this update."""
-        factor = self.config.rate_factor(self.update)
-        rates = (self.policy_optimiser, self.config.policy_rate), (self.critic_optimiser, self.config.critic_rate)
-        for optimiser, rate in rates:
-            for group in optimiser.param_groups:
-                group["lr"] = factor * rate
+        factor, config = self.config.rate_factor(self.update), self.config
+        self.policy_optimiser.param_groups[0]["lr"] = factor * config.policy_rate
+        self.critic_optimiser.param_groups[0]["lr"] = factor * config.critic_rate
 
     def drive(self, credit: float) -> RolloutSteps:
         """Drive the next pool for a horizon; a pool that is too old is restarted from the record."""

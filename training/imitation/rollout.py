@@ -135,10 +135,9 @@ def draw_pool(
     colour: AutoregressiveNoise,
     generator: torch.Generator,
 ) -> ScenePool:
-    """Return a pool of `size` scenes among some (k,), at random moments of their records.
+    """Return a pool of `size` scenes among some (k,), at random moments with at least `shortest` ticks of record left.
 
-    At most so many vehicles of each, the rearmost, are driven, and at least `shortest` ticks of record remain, if the
-    scene is that long.
+    At most so many vehicles of each, the rearmost, are driven.
     """
     scene = among[torch.randint(len(among), (size,), generator=generator)]
     last = (recording.ticks[scene] - shortest).clamp(min=1)
@@ -149,16 +148,15 @@ def draw_pool(
 
 
 class RolloutSteps(NamedTuple):
-    """Moments of driven vehicles, n in all: T ticks, each with the same vehicles in the same order.
-
-    Features (n, 51) in SI units, normalised actions (n, 2), costs (n,) each, and the expected noise of the action given
-    the ticks before (n, 2).
-    """
+    """Moments of driven vehicles, n in all: T ticks, each with the same vehicles in the same order."""
 
     features: Tensor
+    """Shape (n, 51), SI units."""
     action: Tensor
+    """Normalised, shape (n, 2)."""
     costs: Penalties
     noise: Tensor
+    """Expected noise of the action given the ticks before, shape (n, 2)."""
 
 
 def roll_out(
@@ -170,10 +168,9 @@ def roll_out(
     credit: float,
     generator: torch.Generator,
 ) -> tuple[RolloutSteps, ScenePool]:
-    """Drive a pool for some ticks by a policy that all driven vehicles share.
+    """Drive a pool for some ticks; return the moments, differentiable in the policy's weights, and the pool afterwards.
 
-    Each tick passes `credit`, a share, of the gradient of the state on to the tick before. Returns the moments,
-    differentiable in the policy's weights, and the pool afterwards, which is not.
+    Each tick passes `credit`, a share, of the gradient of the state on to the tick before.
     """
     traffic, memory = pool.traffic, pool.noise
     m = memory.shape[1]

@@ -151,10 +151,9 @@ def replay_features(traffic: Traffic, observers: int | None = None) -> Tensor:
 
 
 def step_replay(recording: Recording, traffic: Traffic, action: Tensor) -> Traffic:
-    """Return traffic one tick later, differentiable in traffic and action: explicit Euler with the old values.
+    """Return traffic one tick later, differentiable: explicit Euler, which `infer_motion` inverts.
 
-    `infer_motion` inverts it. Of the actions (B, V, 2), acceleration [m/s^2] and yaw rate [rad/s], only those of driven
-    vehicles count; the others are at their recorded places where the record continues.
+    Of the actions (B, V, 2) [m/s^2, rad/s] those of driven vehicles count; others follow the record while it goes on.
     """
     moving = traffic.driven.to(traffic.x.dtype)
     x = traffic.x + traffic.speed * torch.cos(traffic.heading) * DT

@@ -90,21 +90,6 @@ def test_queues_that_brake_comfortably_are_followed_without_contact():
         assert gap > 0.0
 
 
-@pytest.mark.slow
-def test_gradients_are_those_of_finite_differences():
-    features = torch.cat(
-        [
-            seen(range_0=30.0, rate_0=-15.0),
-            seen(range_0=15.0, rate_0=-1.0, range_90=2.3, rate_90=-0.2, range_m90=1.8, rate_m90=0.1),
-            seen(),
-            on_lane(seen(range_0=3.4, rate_0=-0.5, range_90=1.2, rate_90=-0.1), 0.01),
-        ]
-    ).requires_grad_()
-    wanted = [[[1.0, 0.6]], [[0.5, 0.5]], [[0.3, -0.01]], [[0.5, 0.2]]]
-    action = torch.tensor(wanted, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *given: RULE.limit(Seen.read(given[0]), given[1]), (features, action))
-
-
 @pytest.mark.parametrize("side", [0, 1])
 def test_within_some_room_steering_is_bounded_by_the_way_that_is_left_and_leads_back_from_beyond(side):
     """At 20 m/s and 0.6 m/s towards a line, or away from it: (d / 0.6 s - v) / (0.2 s 20 m/s)."""

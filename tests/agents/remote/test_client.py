@@ -33,7 +33,7 @@ from agents.remote.protocol import derive_server_keys
 from agents.remote.server import EgoServer, RequestHandler, is_loopback
 from rare_envs.plugins import EgoGone, NoAnswer
 from samplers.evaluate import Evaluator
-from tests.agents.remote.egos import ENV, Averaging, Braking, problem
+from tests.agents.remote.egos import Averaging, Braking, problem
 
 
 @pytest.mark.parametrize("ego", [Braking(), Averaging()])
@@ -283,26 +283,6 @@ def test_wrong_addresses_are_refused(serve: Any) -> None:
             EgoServer(Braking(), address)
     for address in ("tcp://127.0.0.1:*", "tcp://localhost:1", "tcp://[::1]:1", "ipc:///tmp/ego"):
         assert is_loopback(address)
-
-
-@pytest.mark.parametrize("where", ["tcp", pytest.param("process", marks=pytest.mark.slow)])
-def test_an_ego_elsewhere_sees_camera_and_lidar_as_at_home(where: str, serve: Any, tmp_path: Path) -> None:
-    """Pictures, whose channels come first in the space of the policy, and numbers."""
-    from stable_baselines3 import PPO
-
-    from training import sb3_vec_env
-
-    world: dict[str, Any] = {"observation": "camera+lidar", "camera": (36, 64), "horizon": 0.5}
-    env = sb3_vec_env(ENV, num_envs=1, seed=0, **world)
-    PPO("MultiInputPolicy", env, seed=0, device="cpu").save(tmp_path / "ego.zip")
-    home = load_ego(tmp_path / "ego.zip")
-    assert home.observation_space["camera"].shape == (3, 36, 64)
-    there = load_ego(f"process:{tmp_path}/ego.zip" if where == "process" else serve(home).address)
-    assert there.observation_space == home.observation_space
-    problems = [rare_envs.DrivingProblem(ENV, ego=ego, measure="clearance", **world) for ego in (home, there)]
-    x = problems[0].base.sample(3, np.random.default_rng(0))
-    np.testing.assert_array_equal(problems[1].evaluate(x), problems[0].evaluate(x))
-    there.close()
 
 
 def test_noise_on_the_socket_does_not_end_the_server(serve: Any, connect_ego: Any) -> None:

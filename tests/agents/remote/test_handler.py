@@ -130,21 +130,6 @@ def test_a_hello_comes_first_and_ids_rise() -> None:
     assert ask(handler, type="dance", id=8)["code"] == "unknown"
 
 
-def test_an_ego_that_fails_ends_its_session_only() -> None:
-    class Failing(Braking):
-        def predict(self, observation: Any, **_: Any) -> Any:
-            raise SystemExit(3) if observation[0, 0] else RuntimeError("no road")
-
-    handler = RequestHandler(Failing())
-    ask(handler, type="hello", protocol=1, id=1)
-    for number, (value, reason) in enumerate(((0.0, "RuntimeError: no road"), (1.0, "SystemExit(3)"))):
-        ask(handler, type="reset", id=10 * number + 2, session=1, batch=1)
-        act = {"type": "act", "session": 1, "step": 0, "observation": protocol.pack_array(np.full((1, 7), value))}
-        reply = ask(handler, id=10 * number + 3, **act)
-        assert (reply["code"], reply["reason"]) == ("ego", reason)
-        assert ask(handler, id=10 * number + 4, **act)["code"] == "session"
-
-
 def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that was forgotten is told so, and sends its observations again."""
 

@@ -196,13 +196,6 @@ def assert_same_drives(loaded: Any, policy: Any, env: Any, count: int = 4) -> No
     assert len(set(alone)) > 2
 
 
-@pytest.mark.parametrize("name", ["dqn", "recurrent ppo"])
-def test_a_saved_policy_drives_as_in_its_own_loop(name: str, tmp_path: Path) -> None:
-    model = untrained(name)
-    model.save(tmp_path / "ego.zip")
-    assert_same_drives(load(tmp_path / "ego.zip"), model, one_env())
-
-
 def trained(statistics: VecNormalize) -> VecNormalize:
     statistics.seed(0)  # else each run has statistics of its own, and a small variance enlarges what networks round
     statistics.reset()
