@@ -17,7 +17,7 @@ from samplers.executors import FuturesPool, InProcess, LocalProcesses, RayCluste
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods import METHODS, Auto, get_method
 from samplers.methods.base import Method
-from samplers.methods.blocks import BetaBlock, GaussianBlock, MappedBlock, MixtureBlock, NormalBlock, Product
+from samplers.methods.blocks import BetaBlock, GaussianBlock, MixtureBlock, NormalBlock, Product
 from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
@@ -68,7 +68,6 @@ __all__ = [
     "Layer",
     "Level",
     "LocalProcesses",
-    "MappedBlock",
     "Method",
     "MixtureBlock",
     "MonteCarlo",

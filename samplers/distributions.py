@@ -349,8 +349,10 @@ def find_base_fault(base: Any, dim: int, n: int = N_DRAWS) -> str | None:
     its draws looked at.
     """
     x = np.asarray(base.sample(n, np.random.default_rng(0)), dtype=np.float64)
-    if x.shape != (n, dim) or not np.isfinite(x).all():
-        return f"sample({n}) gave shape {x.shape}" if x.shape != (n, dim) else f"sample({n}) gave NaN or infinity"
+    if x.shape != (n, dim):
+        return f"sample({n}) gave shape {x.shape}"
+    if not np.isfinite(x).all():
+        return f"sample({n}) gave NaN or infinity"
     log_p = np.asarray(base.log_prob(x), dtype=np.float64)
     if log_p.shape != (n,) or not np.isfinite(log_p).all():
         return f"log_prob of its own draws is not {n} finite numbers"

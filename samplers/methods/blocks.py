@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
 from samplers.components import expectation_maximisation, one_hot, posterior
-from samplers.distributions import Gaussian, IndependentDistributions, convert
+from samplers.distributions import Gaussian, IndependentDistributions
 from samplers.problem import FloatArray, Inputs, needs_library
 from samplers.proposals import Mixture, move_gaussian
 
@@ -355,70 +355,6 @@ class MixtureBlock(_GaussianInBase):
         return replace(self, mixture=self._present.widen(factor))
 
 
-@dataclass(frozen=True, eq=False)
-class MappedBlock:
-    """Any distribution, whose image in standard normal space is a Gaussian with mean and covariance that may move.
-
-    With u the image of x, p its density in the base distribution and q that of the Gaussian, the density of a proposal
-    is p(x) q(u) / phi(u).
-
-    Args:
-        distribution: Its distribution in the base, one of SciPy or OpenTURNS by `samplers.as_distribution`.
-        image: The present Gaussian of u; None for N(0, I), that of the base.
-
-    Example:
-        >>> import numpy as np
-        >>> from scipy import stats
-        >>> from samplers.distributions import as_distribution
-        >>> block = MappedBlock(as_distribution(stats.expon()))
-        >>> moved = block.project(np.full((10, 1), 8.0), np.full(10, 0.1), alpha=1.0)
-        >>> bool(moved.log_prob(np.array([[8.0]]))[0] > block.log_prob(np.array([[8.0]]))[0])
-        True
-    """
-
-    distribution: Any
-    image: Gaussian | None = None
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates b."""
-        return int(self.distribution.dim)
-
-    @property
-    def _present(self) -> Gaussian:
-        return self.image or Gaussian.standard(self.dim)
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, b)."""
-        return self.from_standard_normal(self._present.sample(n, rng))
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, b), shape (n,)."""
-        log_p = np.asarray(self.distribution.log_prob(x))
-        if self.image is None:
-            return log_p
-        found, inside = np.full(len(x), -np.inf), np.isfinite(log_p)
-        u = self.to_standard_normal(x[inside])
-        found[inside] = log_p[inside] + self.image.log_prob(u) - Gaussian.standard(self.dim).log_prob(u)
-        return found
-
-    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x ~ the distribution of the base, shape (n, b), to u ~ N(0, I)."""
-        return np.asarray(self.distribution.to_standard_normal(x))
-
-    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Inverse of `to_standard_normal`."""
-        return np.asarray(self.distribution.from_standard_normal(u))
-
-    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "MappedBlock":
-        """Return the projection of alpha Q + (1 - alpha) P, whose divergences are those of the images."""
-        return replace(self, image=move_gaussian(self._present, self.to_standard_normal(x), weights, alpha))
-
-    def widen(self, factor: float) -> "MappedBlock":
-        """Return the block whose image has `factor` times the standard deviations."""
-        return replace(self, image=self._present.widen(factor))
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Product(IndependentDistributions):
     """Independent blocks of consecutive coordinates: a base distribution, or a proposal of the search.
@@ -426,11 +362,10 @@ class Product(IndependentDistributions):
     As a base distribution it announces its blocks to `CrossEntropy(family="blocks")`.
 
     Args:
-        blocks: In the order of the coordinates: those of this module, or objects with the same methods; a distribution
-            of SciPy or OpenTURNS (`as_distribution`) becomes a `MappedBlock`.
+        blocks: In the order of the coordinates: those of this module, or objects with the same methods.
 
     Raises:
-        ValueError: If there is no block, or one is not as described.
+        ValueError: If there is no block, or one is none.
 
     Example:
         >>> import numpy as np
@@ -445,11 +380,9 @@ class Product(IndependentDistributions):
 
     def __post_init__(self) -> None:
         """Make a tuple of the blocks."""
-        if not self.blocks:
-            raise ValueError("Product: expected at least one block.")
-        converted = ((block, convert(block)) for block in self.blocks)
-        blocks = tuple(block if known is None else MappedBlock(known) for block, known in converted)
-        object.__setattr__(self, "blocks", blocks)
+        object.__setattr__(self, "blocks", tuple(self.blocks))
+        if not self.blocks or not all(hasattr(block, "project") for block in self.blocks):
+            raise ValueError(f"Product: expected one block or more, got {self.blocks!r}.")
 
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Product":
         """Return the projection of alpha Q + (1 - alpha) P, block by block (equation 2).
@@ -470,8 +403,8 @@ def announced_blocks(inputs: Inputs) -> Product:
 
     `inputs.base.blocks` holds one entry per block, in the order of the coordinates: a block, or
     any object with the attributes alpha, beta, low and high (and box, if that is not the paper's),
-    or with mean and covariance (and radius, if the mean is to stay in a box), or with a map to standard normal space. A
-    ValueError says that there are no blocks, one is not as described, or their product is not the base distribution.
+    or with mean and covariance (and radius, if the mean is to stay in a box). A ValueError says that there are no
+    blocks, one is not as described, or their product is not the base distribution.
     """
     announced = getattr(inputs.base, "blocks", None)  # the user's own class
     if not announced:
@@ -499,9 +432,7 @@ def _as_block(entry: Any) -> Any:
     if hasattr(entry, "mean") and hasattr(entry, "covariance"):
         gaussian = Gaussian.from_covariance(entry.mean, entry.covariance)
         return NormalBlock(gaussian, getattr(entry, "radius", math.inf))
-    if hasattr(entry, "to_standard_normal"):
-        return MappedBlock(entry)
     raise ValueError(
         "CrossEntropy: expected a block with alpha, beta, low and high or with mean and covariance, "
-        f"got {type(entry).__name__}."
+        f'got {type(entry).__name__}; the family "gaussian" works with any base.'
     )

@@ -99,10 +99,7 @@ class Pool(NamedTuple):
         return self.log_proposal + 0.5 * self.prediction.log_safe
 
     def forecast_cov(self, n: int) -> float:
-        """Return the c.o.v. that n draws of the proposal would have if the surrogate's probabilities were true.
-
-        With b ~ w sqrt(P), n cov^2 = (sum w sqrt(P) / sum w P)^2 - 1.
-        """
+        """Return the c.o.v. of n draws if the surrogate is right: n cov^2 = (sum w sqrt(P) / sum w P)^2 - 1."""
         ratio = float(logsumexp(self.log_proposal)) - logsumexp(self.log_weights + self.prediction.log_fail)
         return float(np.sqrt(np.expm1(min(2 * ratio, 100.0)) / max(n, 1)))
 
@@ -142,16 +139,6 @@ class PoolProposal(NamedTuple):
         logs = (pool.log_proposal, pool.log_weights, pool.log_weights - log_wide_weights, pool.doubted.log_proposal)
         return cls(pool, np.array([normalise_weights(log) for log in logs]), log_wide_weights)
 
-    @property
-    def largest_weight(self) -> float:
-        """Upper bound of the weights."""
-        return float(np.exp(logsumexp(self.pool.log_weights))) / (len(self.pool.u) * float(PART_SHARES[BASE]))
-
-    @property
-    def pool_variance(self) -> float:
-        """Squared c.o.v. that the pool itself adds: 1 / its effective number of draws that may fail."""
-        return 1 / effective_sample_size(self.pool.log_weights + self.pool.prediction.log_fail)
-
     def draw(self, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
         """Draw n of the pool: return their rows, log(w / (N b)) and the part that each was drawn from, (n,) each."""
         part = rng.choice(len(PARTS), n, p=PART_SHARES)
@@ -161,14 +148,6 @@ class PoolProposal(NamedTuple):
         probability = PART_SHARES @ self.probabilities[:, chosen]
         log_weights = self.pool.log_weights[chosen] - np.log(len(self.pool.u) * probability)
         return chosen, log_weights, part
-
-
-def draw_design(n: int, dim: int, rng: np.random.Generator) -> FloatArray:
-    """Return n points, an equal number of each N(0, s^2 I), as Latin hypercubes, in the order of `SCALES`."""
-    from scipy.stats import qmc  # takes a second to import
-
-    cubes = [ndtri(qmc.LatinHypercube(dim, rng=rng).random(n // len(SCALES))) for _ in SCALES]
-    return np.concatenate([scale * cube for scale, cube in zip(SCALES, cubes, strict=True)])
 
 
 def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator) -> FloatArray:
@@ -211,11 +190,14 @@ class SurrogateRun:
 
     def steps(self) -> Steps:
         """Learn; then estimate, or leave it to plain Monte Carlo."""
+        from scipy.stats import qmc  # takes a second to import
+
         size = min(self.budget // 4, 30 + 10 * self.inputs.dim)
         each = max(size // len(SCALES), 1)
         self.n_design = each * len(SCALES)
+        cubes = [s * ndtri(qmc.LatinHypercube(self.inputs.dim, rng=self.rng).random(each)) for s in SCALES]
         try:
-            yield from self._simulate(draw_design(self.n_design, self.inputs.dim, self.rng))
+            yield from self._simulate(np.concatenate(cubes))
             if (self.f[:each] <= self.goal.gamma).mean() >= 0.1:  # of base draws: plain Monte Carlo is as good
                 return (yield from self.draw_base())
             kriging, mixture = yield from self._learn()
@@ -303,7 +285,8 @@ class SurrogateRun:
             draws = draws.join(Draws.from_outcomes(f, log_weights, x, goal.gamma))
             kinds += [np.bincount(each, minlength=4) for each in (part, part[fails])]
             wide = np.concatenate([wide, proposal.log_wide_weights[chosen][fails & (part == WIDE)]])
-            cov = math.hypot(draws.cov, math.sqrt(proposal.pool_variance))
+            may_fail = effective_sample_size(proposal.pool.log_weights + proposal.pool.prediction.log_fail)
+            cov = math.hypot(draws.cov, math.sqrt(1 / may_fail))
             left -= len(f)
             self.simulator.record(float(fails.mean()), draws.p, len(f), cov, draws.ess)
             if left > 0 and draws.n < 1000:  # kriging costs the cube of their number
@@ -312,7 +295,8 @@ class SurrogateRun:
                 proposal, mixture = self._build_proposal(kriging, mixture)
         if draws.n == 0:
             return self._estimate_early(status if status is Status.STOPPED else Status.BUDGET)
-        outcome = self._outcome(draws, cov, proposal.largest_weight, status)
+        largest = float(np.exp(logsumexp(proposal.pool.log_weights))) / (FINAL_POOL * float(PART_SHARES[BASE]))
+        outcome = self._outcome(draws, cov, largest, status)
         lineages = max(count_lineages(self.failing_batches, wide), 1.0)
         n, failing = kinds[:, SURROGATE]
         poor = f"Only {failing:.0f} of {n:.0f} draws proposed by the surrogate failed: it fits f poorly."

@@ -10,10 +10,8 @@ from scipy.special import betaln
 
 import samplers
 from samplers import Distribution
-from samplers.distributions import as_distribution
 from samplers.methods.blocks import (
     BetaBlock,
-    MappedBlock,
     NormalBlock,
     Product,
     announced_blocks,
@@ -167,31 +165,6 @@ def test_mean_projection_against_a_generic_solver(rng, scale):
         np.testing.assert_allclose(found, generic, atol=1e-5 * scale)
     clipped = np.clip(target, centre - radius, centre + radius)
     assert distance(found, target, cholesky) < 0.99 * distance(clipped, target, cholesky)
-
-
-@pytest.fixture
-def moved():
-    block = MappedBlock(as_distribution(stats.expon()))
-    elite = stats.expon.isf([[1e-3], [2e-3], [4e-3], [8e-3]])
-    return block.project(elite, np.full(4, 0.25), alpha=0.8)
-
-
-def test_a_moved_block_is_a_distribution(moved):
-    """Its density integrates to 1, and its draws have it."""
-    x = np.linspace(1e-9, 60.0, 600_001)[:, None]
-    density = np.exp(moved.log_prob(x))
-    assert np.trapezoid(density, x[:, 0]) == pytest.approx(1.0, abs=1e-4)
-    cdf = np.interp(np.sort(moved.sample(4000, np.random.default_rng(0))[:, 0]), x[:, 0], np.cumsum(density) * 1e-4)
-    assert stats.kstest(cdf, "uniform").pvalue > 1e-3
-
-
-def test_a_product_takes_distributions_of_scipy_and_openturns():
-    openturns = pytest.importorskip("openturns")
-    base = samplers.Product(
-        [stats.lognorm(0.5), samplers.BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0), openturns.ClaytonCopula(2.0)]
-    )
-    assert base.dim == 4
-    assert isinstance(base.blocks[0], MappedBlock)
 
 
 CE = samplers.CrossEntropy
