@@ -22,13 +22,9 @@ def test_clopper_pearson_against_scipy():
         np.testing.assert_allclose(clopper_pearson(hits, 50, 0.9), exact)
 
 
-def lengths_of(inside):
-    return np.full(len(inside), inside.shape[1])
-
-
 def test_correlation_factor_of_frozen_chains_is_length_minus_one():
     inside = np.repeat(np.arange(40)[:, None] < 10, 8, axis=1)
-    assert correlation_factor(inside, lengths_of(inside)) == pytest.approx(7.0)
+    assert correlation_factor(inside, np.full(40, 8)) == pytest.approx(7.0)
 
 
 def markov_chains(rng, chains, steps, p, stay):
@@ -44,7 +40,7 @@ def test_correlation_factor_predicts_the_variance_of_a_share(rng):
     chains, steps, p, stay, runs = 100, 10, 0.1, 0.8, 1500
     sets = [markov_chains(rng, chains, steps, p, stay) for _ in range(runs)]
     shares = np.array([inside.mean() for inside in sets])
-    predicted = [(1 + correlation_factor(s, lengths_of(s))) * p * (1 - p) / (chains * steps) for s in sets]
+    predicted = [(1 + correlation_factor(s, np.full(chains, steps))) * p * (1 - p) / (chains * steps) for s in sets]
     # the variance of 1500 shares has a relative standard error of sqrt(2 / 1500) = 3.7 %
     assert np.mean(predicted) == pytest.approx(shares.var(), rel=0.15)
 

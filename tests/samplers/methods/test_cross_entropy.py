@@ -57,14 +57,6 @@ def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
     np.testing.assert_allclose(moved.blocks[0].gaussian.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
 
 
-def test_target_cov_is_met_by_more_final_draws():
-    loose = samplers.estimate(half_space().problem, CE(), seed=1)
-    tight = samplers.estimate(half_space().problem, CE(), seed=1, target_cov=0.01)
-    assert loose.cov > 0.01 >= tight.cov
-    assert tight.status == "converged"
-    assert tight.n_sim > loose.n_sim
-
-
 @pytest.mark.slow
 def test_interval_of_a_hopeless_proposal_still_holds_p():
     """d = 300: the weights degenerate, p-hat is far too small, and the result does not hide it."""

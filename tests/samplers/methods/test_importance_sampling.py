@@ -39,14 +39,10 @@ def test_unbiased_and_covered_where_one_tilt_serves(study, reference):
 
 
 def test_stops_at_the_relative_half_width():
-    result = samplers.estimate(half_space().problem, IS(), seed=1)
-    assert result.cov <= 0.2 / 1.96
-    assert result.status == "converged"
     narrow = samplers.estimate(half_space().problem, IS(half_width=0.05, batch=500), seed=1)
     final = [level for level in narrow.trace if level.n_points == 500][-2:]
     assert final[1].cov <= 0.05 / 1.96 < final[0].cov
-    aimed = samplers.estimate(half_space().problem, IS(), seed=1, target_cov=0.02)
-    assert aimed.cov <= 0.02
+    assert narrow.status == "converged"
 
 
 @pytest.mark.parametrize("reference", [four_branches(3.0)], ids=lambda r: r.name)

@@ -87,33 +87,21 @@ def test_one_estimate_against_exact_p(name):
     assert first == again
 
 
+@pytest.mark.parametrize("name", ["mc", "is", "ce", "ice", "two-stage", pytest.param("surrogate", marks=SLOW)])
+def test_a_target_is_met_or_ends_at_max_sim(name):
+    reference = half_space(3, 2.5)
+    met = samplers.estimate(reference.problem, name, seed=1, target_cov=0.08)
+    assert met.cov <= 0.08 and met.status == "converged"
+    missed = samplers.estimate(reference.problem, name, seed=1, target_cov=0.001, max_sim=3000)
+    assert (missed.n_sim, missed.status) == (3000, "budget")
+
+
 @pytest.mark.slow
 def test_works_through_any_base(method):
-    """An exponential distribution: P[x1 + x2 >= 14] has a closed form."""
-
-    class Exponential:
-        def sample(self, n, rng):
-            return rng.exponential(size=(n, 2))
-
-        def log_prob(self, x):
-            return -x.sum(axis=1)
-
-        def to_standard_normal(self, x):
-            return stats.norm.isf(np.exp(-x))
-
-        def from_standard_normal(self, u):
-            return -stats.norm.logsf(u)
-
-    class Sum:
-        dim, base = 2, Exponential()
-
-        def evaluate(self, x):
-            assert (x >= 0).all()
-            return 7.0 - x.sum(axis=1)
-
-    p = stats.gamma.sf(7.0, 2)
-    runs = 8
-    results = [samplers.estimate(Sum(), method, seed=seed, max_sim=MAX_SIM.get(method.name)) for seed in range(runs)]
+    """Independent exponentials: P[x1 + x2 >= 7] has a closed form."""
+    problem = FunctionProblem(lambda x: 7.0 - x.sum(axis=1), base=[stats.expon(), stats.expon()])
+    p, runs = stats.gamma.sf(7.0, 2), 8
+    results = [samplers.estimate(problem, method, seed=seed, max_sim=MAX_SIM.get(method.name)) for seed in range(runs)]
     ratios = np.array([result.p for result in results]) / p
     assert ratios.mean() == pytest.approx(1.0, abs=4 * ratios.std(ddof=1) / np.sqrt(runs) + 0.04)
     assert (results[0].failures.x.sum(axis=1) >= 7.0).all()

@@ -21,16 +21,6 @@ def test_is_the_share_of_failures_with_the_exact_interval():
     assert result.interval == samplers.sample.clopper_pearson(result.failures.total, 2000, 0.95)
 
 
-def test_stops_at_the_target():
-    method = samplers.MonteCarlo(batch=500)
-    result = samplers.estimate(EASY.problem, method, seed=1, target_cov=0.1)
-    assert result.cov <= 0.1
-    assert result.status == "converged"
-    # (1 - p) / (p 0.01) = 1397 expected, and one batch more at most
-    assert 1000 <= result.n_sim <= 2500
-    assert result.trace[-2].cov > 0.1
-
-
 def test_draws_from_the_base_itself():
     """Its points come from base.sample: a base needs no map from standard normal space."""
 

@@ -23,17 +23,13 @@ class PartlyNoise(StandardNormal):
         return np.arange(self.dim) >= self.first
 
 
-def problem_with_noise(f, dim, first=1):
-    return FunctionProblem(f, dim, base=PartlyNoise(dim, first))
-
-
 def sum_of(u):
     """Standard normal, from all of the noise."""
     return u[:, 3:].sum(axis=1) / np.sqrt(u.shape[1] - 3)
 
 
 def problem(f):
-    return problem_with_noise(f, 303, first=3)
+    return FunctionProblem(f, 303, base=PartlyNoise(303, 3))
 
 
 PROBLEMS = {
@@ -46,6 +42,15 @@ PROBLEMS = {
     "noise alone": (lambda u: 3.2 - sum_of(u), PHI(-3.2)),
 }
 GAINS = {"noise that does nothing": 1000, "noise beside a parameter": 10, "two regions": 10, "noise alone": 0.5}
+
+
+@pytest.mark.slow
+def test_surrogate_does_not_search_them():
+    f, p = PROBLEMS["noise beside a parameter"]
+    result = samplers.estimate(problem(f), "surrogate", seed=2, max_sim=300)
+    assert not any("takes over" in text for text in result.remarks)
+    assert result.interval[0] <= p <= result.interval[1]
+    assert result.cov < 0.5
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

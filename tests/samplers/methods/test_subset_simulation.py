@@ -1,5 +1,6 @@
 """Subset simulation: points kept, ties, budgets, spread and coverage."""
 
+import itertools
 import math
 
 import numpy as np
@@ -16,37 +17,24 @@ ADSS = samplers.AdaptiveSubsetSimulation
 SS = samplers.SubsetSimulation
 
 
-def run(problem, seed=1, **settings):
-    return samplers.estimate(problem, ADSS(**settings), seed=seed)
-
-
-def seeds_of(trace):
-    """Points that each level after the first took over from the one before."""
-    return [round(level.p * level.n_points) for level in trace[:-1]]
-
-
 BOTH = [SS(), ADSS(), ADSS(proposal="metropolis"), SS(distribution="normal")]
 IDS = ["ss", "adss", "adss metropolis", "ss normal"]
 
 
 def test_seeds_are_never_simulated_again(recorder):
     f = recorder(half_space().problem.f)
-    result = run(FunctionProblem(f, 2))
-    assert len(np.unique(f.points, axis=0)) == f.rows
-    for seeds, level in zip(seeds_of(result.trace), result.trace[1:], strict=True):
-        assert level.n_sim == level.n_points - seeds
-        assert level.n_points == 1000
-    assert result.n_sim == 1000 + sum(1000 - seeds for seeds in seeds_of(result.trace))
+    result = samplers.estimate(FunctionProblem(f, 2), ADSS(), seed=1)
+    assert len(np.unique(f.points, axis=0)) == f.rows == result.n_sim
+    for before, level in itertools.pairwise(result.trace):
+        assert level.n_points == 1000 == level.n_sim + round(before.p * before.n_points)
 
 
-def test_no_level_after_the_answer_is_known(recorder):
-    """p = 0.3 is known at level 0, p = 0.02 at level 1."""
-    f = recorder(half_space(2, -stats.norm.ppf(0.3)).problem.f)
-    result = run(FunctionProblem(f, 2))
-    assert result.n_sim == f.rows == 1000
-    assert result.interval == samplers.sample.clopper_pearson(round(1000 * result.p), 1000, 0.95)
-    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
-    assert [level.gamma == 0.0 for level in result.trace] == [False, True]
+@pytest.mark.parametrize(("p", "levels"), [(0.3, [True]), (0.03, [False, True])])
+def test_no_level_after_the_answer_is_known(p, levels):
+    result = samplers.estimate(half_space(2, -stats.norm.ppf(p)).problem, ADSS(), seed=1)
+    assert [level.gamma == 0.0 for level in result.trace] == levels
+    if len(levels) == 1:
+        assert result.interval == samplers.sample.clopper_pearson(round(1000 * result.p), 1000, 0.95)
 
 
 @pytest.mark.parametrize("tied", [0.9, pytest.param(0.95, marks=pytest.mark.slow)])
@@ -88,11 +76,7 @@ def test_the_weighted_points_give_p_at_every_threshold(drive, method):
         assert sample.weights[sample.f <= level.gamma].sum() == pytest.approx(level.estimate)
     np.testing.assert_allclose(reference.problem.evaluate(sample.x), sample.f[sample.f <= 0])
     assert sample.n_units == 1000
-    assert sample.units.min() >= 0
-    assert sample.units.max() < 1000
-    assert len(sample.f) == len(sample.weights) == len(sample.units)
-    failing = sample.units[sample.f <= 0]  # descent as the c.o.v. sees it
-    assert outcome.cov >= descent_cov(failing, 1000)
+    assert outcome.cov >= descent_cov(sample.units[sample.f <= 0], 1000)
     median = reference.problem.evaluate(np.zeros((1, 3)))[0]
     assert sample.weights[sample.f <= median].sum() == pytest.approx(0.5, abs=0.06)
 

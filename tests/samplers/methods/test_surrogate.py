@@ -41,26 +41,6 @@ def test_many_dimensions_are_left_to_two_stage():
     assert "two-stage takes over" in result.remarks[0]
 
 
-@pytest.mark.slow
-def test_noise_coordinates_are_not_searched():
-    class Base(samplers.StandardNormal):
-        noise = np.arange(102) >= 2
-
-    class Noisy:
-        """u_1 decides, with the simulator's own noise in 100 coordinates."""
-
-        dim, base = 102, Base(102)
-
-        def evaluate(self, x):
-            return 3.0 - x[:, 0] + 0.3 * x[:, 2:].sum(axis=1) / 10.0
-
-    result = samplers.estimate(Noisy(), "surrogate", seed=2, max_sim=300)
-    p = ndtr(-3.0 / np.hypot(1.0, 0.3))
-    assert not any("takes over" in text for text in result.remarks)
-    assert result.interval[0] <= p <= result.interval[1]
-    assert result.cov < 0.5
-
-
 def run(f, dim, seed=0, max_sim=300, **options):
     return samplers.estimate(FunctionProblem(f, dim), "surrogate", seed=seed, max_sim=max_sim, **options)
 
