@@ -36,7 +36,7 @@ from samplers.problem import (
 )
 from samplers.result import Estimate
 from samplers.run import Progress, Run, RunArguments
-from samplers.sample import Failure, Failures, Layer, Level, Sample, SimulatedPoints, Status
+from samplers.sample import Failures, Level, Sample, Status
 from samplers.workers import ExecutorError
 
 __all__ = [
@@ -54,7 +54,6 @@ __all__ = [
     "EvaluationError",
     "Executor",
     "ExecutorError",
-    "Failure",
     "Failures",
     "FittedBase",
     "FunctionProblem",
@@ -65,7 +64,6 @@ __all__ = [
     "ImprovedCrossEntropy",
     "InProcess",
     "Interrupted",
-    "Layer",
     "Level",
     "LocalProcesses",
     "Method",
@@ -86,7 +84,6 @@ __all__ = [
     "Sample",
     "Sensitivity",
     "Share",
-    "SimulatedPoints",
     "StandardNormal",
     "Status",
     "Stepping",

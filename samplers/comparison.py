@@ -26,7 +26,7 @@ from samplers.output import (
     to_json_value,
     write_object,
 )
-from samplers.problem import FloatArray, Problem, check_whole, condition_of, names_of_columns
+from samplers.problem import FloatArray, Problem, check_whole, names_of_columns
 from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
 from samplers.sample import Interval, degrees_of_freedom, effective_number, zero_hit_bound
@@ -184,7 +184,7 @@ class EitherFails:
 
     def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
         self.dim, self.base = int(a.dim), a.base
-        self.given = ", ".join(dict.fromkeys(given for problem in (a, b) if (given := condition_of(problem))))
+        self.given = ", ".join(dict.fromkeys(given for problem in (a, b) if (given := getattr(problem, "given", ""))))
         self.column_names = names_of_columns(a)
         self.n_sim = 0
         self._problems, self._gamma = (a, b), gamma

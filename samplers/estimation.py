@@ -81,12 +81,11 @@ def estimate(
 ) -> Estimate:
     """Estimate P[f(X) <= gamma], X ~ problem.base.
 
-    Where the base distribution was fitted and has refits (`FittedBase`), the failing points of the run also give p
-    under each refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). They do not reach
-    the refits where more than a tenth of these rest on under 10 effective failing points, which is known without
-    simulations. Then one further run is made under the mixture of the refits: `base.covering_ensemble()` where there is
-    one, else `base.ensemble()`. It has the same method (`TwoStage`, if that one cannot search under a mixture), seed
-    and rule for errors, no replicates and no target_cov. p and its interval remain those of the first run.
+    Where the base distribution was fitted and has refits (`FittedBase`), the failing points also give p under each
+    refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). Where they do not reach more
+    than a tenth of the refits (under 10 effective points), one further run is made under the mixture of the refits,
+    `base.covering_ensemble()` or `base.ensemble()`, with the same method (`TwoStage`, if that one cannot search under a
+    mixture), seed and rule for errors. p and its interval remain those of the first run.
 
     Args:
         problem: Has `dim`, `base` and `evaluate`; see `Problem`.
@@ -94,44 +93,32 @@ def estimate(
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.
-        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so. If the replicates
-            together miss it, further independent runs are made and combined with them (at least 5 in all, unless counts
-            are pooled). They end when the target is met, when 200 runs are made, or when the rest of max_sim is too
-            small for one more run (pooled runs use all of it). They also end when as many runs as `replicates` have
-            come to the limit of their method (`n` of MonteCarlo without max_sim, 100 batches of CrossEntropy). If the
-            target is then not met the status is "budget".
+        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so. If the replicates miss it
+            together, further independent runs are combined with them (at least 5 in all, unless counts are pooled):
+            until it is met, 200 runs are made, as many as `replicates` have come to the limit of their method, or the
+            rest of max_sim is too small for one more. If it is not met the status is "budget".
         confidence: Nominal coverage of the interval.
-        replicates: Independent runs, side by side: f gets the points of all of them in one batch,
-            and each has an equal share of max_sim. Runs of MonteCarlo are pooled: failing draws
-            of all runs by draws of all runs, with the Clopper-Pearson interval of these counts.
-            All others are combined by their mean with a t interval on the log scale, which is
-            very wide with 2 or 3 runs.
-        on_error: Where f raises or returns NaN: "raise" stops and names the row; "failure" counts
-            the point as failing; "bound" counts it as failing in p and in the upper end of the
-            interval, but not in the lower end.
+        replicates: Independent runs, side by side: f gets the points of all of them in one batch, and each has an equal
+            share of max_sim. Counts of MonteCarlo are pooled (Clopper-Pearson); others are combined by their mean with
+            a t interval on the log scale, which is very wide with 2 or 3 runs.
+        on_error: Where f raises or returns NaN: "raise" stops and names the row; "failure" counts the point as failing;
+            "bound" counts it as failing in p and in the upper end of the interval, but not in the lower end.
         progress: True for a bar on standard error, or a function that gets `Progress`.
-        time_limit: Seconds after which the run is stopped. It is checked after every batch; a batch
-            that has begun is not cut short.
-        stop: Function that gets `Progress` after every batch; the run is stopped when it returns
-            True.
-        ensemble_run: Whether the further run may be made. Its simulations are not in `n_sim` but in
-            `base_uncertainty.n_sim`; max_sim limits them anew, time_limit and stop hold for both
-            runs. None is made after a run that was stopped.
-        journal: File that keeps finished simulations, batch by batch. The same call continues a run that was
-            interrupted or killed from there, and comes to the result of an undisturbed run; the file stays when the
-            run is done, and the same call then takes no simulations. A power cut loses one second
-            (`samplers.journal.SYNC_SECONDS`) and the batch. A file that is damaged, used by another process,
-            or was made for other points or another f is refused.
+        time_limit: Seconds after which the run is stopped, checked after every batch.
+        stop: Function that gets `Progress` after every batch; the run is stopped when it returns True.
+        ensemble_run: Whether the further run may be made. Its simulations are in `base_uncertainty.n_sim`; max_sim
+            limits them anew, time_limit and stop hold for both runs. None is made after a run that was stopped.
+        journal: File that keeps finished simulations. The same call continues a run that was interrupted or killed, and
+            comes to the result of an undisturbed run; of one that is done it takes no simulations. A power cut loses
+            one second and the batch. A file that is damaged, in use, or of other points or another f is refused.
         workers: Processes of this machine that simulate, each with one thread; short for
             `executor=LocalProcesses(workers)`. None simulates here, and gives f whole batches.
         executor: Where simulations are made: `LocalProcesses`, `RayCluster` (or "ray"), `InProcess`, or any pool with
-            `submit`, see `FuturesPool`. Batches are split in chunks whose size the problem alone decides (its
-            `chunk_size`), so that the result has the same bits with any executor and any number of workers. A worker
-            that dies, or takes longer than the executor's time limit, costs nothing but time; a row that three workers
-            in a row do not survive is one on which f raises (`on_error`).
-        keep_points: Whether the result shall hold every simulated point (`Estimate.points`, `Estimate.to_pandas`);
-            otherwise it holds the weights of the draws behind p, and x of the failing ones. They take 8 (d + 1) bytes
-            a simulation.
+            `submit`, see `FuturesPool`. The problem alone decides how batches are split (its `chunk_size`), so that the
+            result has the same bits with any executor and any number of workers. A row that three workers in a row do
+            not survive is one on which f raises (`on_error`).
+        keep_points: Whether the result shall hold every simulated point (`Estimate.points`, `Estimate.to_pandas`), 8 (d
+            + 1) bytes each; otherwise it holds the weights of the draws behind p, and x of the failing ones.
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
@@ -142,8 +129,7 @@ def estimate(
             used (`JournalError`).
         OSError: If the journal cannot be written at the beginning.
         ExecutorError: If the executor cannot work at all.
-        EstimationInterrupted: If it is interrupted (a `KeyboardInterrupt`); it has the estimate from the simulations
-            made so far.
+        EstimationInterrupted: If it is interrupted (a `KeyboardInterrupt`); it has the estimate so far.
 
     Example:
         The half-space f = 3.5 - sum(x) / sqrt(10) in ten dimensions, P[f <= 0] = Phi(-3.5) = 2.326e-4:
@@ -157,13 +143,12 @@ def estimate(
         >>> [round(end, 6) for end in checked.interval]
         [9.9e-05, 0.000272]
     """
-    check_problem(problem, "dim", "base", "evaluate")
     chosen = get_method(method) if isinstance(method, str) else method
+    check_base(problem)
     arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
     stops = find_stop(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
-    check_base(problem)
     places = None if workers is None and executor is None else find_executor(workers, executor)
     with _open_journal(journal, problem, seed) as kept:
         known = choose_seed(seed if kept is None else kept.head["seed"])

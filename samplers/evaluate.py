@@ -31,7 +31,6 @@ from samplers.problem import (
     Terms,
     check_number,
     check_whole,
-    condition_of,
     describe_point,
     names_of_columns,
     one_per_row,
@@ -337,18 +336,6 @@ class Evaluator:
         n_made, n_failed: Simulations of which f is known, also of a request that is not complete; those that failed.
         watchers: Each is called with what was simulated, request by request.
         on_chunk: Called with the number of rows of a request that are done, after every chunk.
-
-    Example:
-        >>> import samplers
-        >>> def f(x):
-        ...     if (x > 1).any():
-        ...         raise ArithmeticError("off the map")
-        ...     return x[:, 0]
-        >>> with Evaluator(samplers.FunctionProblem(f, dim=1), on_error="failure") as evaluator:
-        ...     print(evaluator.evaluate(np.array([[0.0], [2.0], [1.0], [0.5]])))
-        [0.  nan 1.  0.5]
-        >>> evaluator.faults, evaluator.n_retried
-        ([Fault(x=array([2.]), reason='ArithmeticError: off the map')], 6)
     """
 
     def __init__(
@@ -373,7 +360,7 @@ class Evaluator:
         """
         self.problem, self._journal, self._executor = problem, journal, executor
         self.dim, self.base = int(problem.dim), problem.base
-        self.given, self.column_names = condition_of(problem), names_of_columns(problem)
+        self.given, self.column_names = str(getattr(problem, "given", "")), names_of_columns(problem)
         self._gamma, self._work = gamma, Work(problem, gamma, on_error, name, None if executor is None else seed)
         self._split = find_chunk_size(problem, size)
         self._size = None if size is None and executor is None else self._split

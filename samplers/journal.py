@@ -64,7 +64,7 @@ class JournalInUse(JournalError):
 class _Damaged(JournalError):
     """A record does not match its digest."""
 
-    def __init__(self, path: Path, number: int) -> None:
+    def __init__(self, path: Path, number: int = HEAD) -> None:
         self.number = number
         where = f": record {number + 1} does" if number > HEAD else " from its first record on, which does"
         super().__init__(f"{str(path)!r} is damaged{where} not match its checksum.")
@@ -98,17 +98,6 @@ class Journal:
         path: Of the file.
         head: What the run is, JSON-ready.
         earlier_seconds: Wall time of the run before this journal was opened, up to its last record [s].
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     journal = Journal.create(Path(folder) / "journal.bin", {"seed": 1})
-        ...     journal.append("of x", np.array([[2.0], [-1.0]]), {}, 2)
-        ...     journal.close()
-        ...     journal = Journal.open(Path(folder) / "journal.bin")
-        ...     print(journal.head, journal.find("of x")[0].ravel(), journal.find("of others"))
-        ...     journal.close()
-        {'seed': 1} [ 2. -1.] None
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, head: dict[str, Any]) -> None:
@@ -155,8 +144,15 @@ class Journal:
             if missing and mend:  # zeros, which no record consists of
                 os.truncate(path, os.stat(path).st_size + missing)
             elif missing and not _wal(path).exists():  # where the end is if it was being copied from there
-                raise _Damaged(path, HEAD)
-            return cls._take_up(path)
+                raise _Damaged(path)
+            connection = _connect(path)
+            try:
+                return cls(path, connection, _verify(path, connection))
+            except BaseException as error:
+                connection.close()
+                if isinstance(error, sqlite3.DatabaseError):
+                    raise _Damaged(path) from error
+                raise
         except _Damaged as damage:
             if missing and not mend:
                 raise JournalError(f"{str(path)!r} is damaged: its end is missing.") from damage
@@ -164,18 +160,6 @@ class Journal:
                 raise
             _keep_before(path, damage.number)
             return cls.open(path)
-
-    @classmethod
-    def _take_up(cls, path: Path) -> Journal:
-        """Return the journal of a file that is there to its end."""
-        connection = _connect(path)
-        try:
-            return cls(path, connection, _verify(path, connection))
-        except BaseException as error:
-            connection.close()
-            if isinstance(error, sqlite3.DatabaseError):
-                raise _Damaged(path, HEAD) from error
-            raise
 
     @property
     def n(self) -> int:
@@ -287,7 +271,7 @@ def _connect(path: Path) -> sqlite3.Connection:
     except sqlite3.DatabaseError as error:
         connection.close()
         if "malformed" in str(error):
-            raise _Damaged(path, HEAD) from error
+            raise _Damaged(path) from error
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.") from error
     return connection
 
@@ -313,11 +297,9 @@ def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
         raise NothingRecorded(f"{str(path)!r} was cut before its first record; nothing is recorded in it.")
     if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT:
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.")
-    notes = [row.notes for row in _good_rows(path, connection) if row.id == HEAD]
-    try:
+    notes, head = [row.notes for row in _good_rows(path, connection) if row.id == HEAD], None
+    with contextlib.suppress(ValueError, RecursionError):
         head = json.loads(notes[0])
-    except (ValueError, RecursionError) as error:
-        raise JournalError(f"{str(path)!r} is no journal: {error}.") from error
     if not isinstance(head, dict):
         raise JournalError(f"{str(path)!r} is no journal: its head is no object.")
     return head
@@ -336,7 +318,7 @@ def _good_rows(path: Path, connection: sqlite3.Connection) -> Iterator[_Row]:
     except sqlite3.DatabaseError as error:
         raise _Damaged(path, number) from error
     if number == HEAD:
-        raise _Damaged(path, HEAD)
+        raise _Damaged(path)
 
 
 def _keep_before(path: Path, number: int) -> None:

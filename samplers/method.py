@@ -100,15 +100,7 @@ class Outcome:
     def of_counts(
         cls, hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float = 0.0
     ) -> "Outcome":
-        """Return the outcome of n independent draws of which `hits` fail: p = hits / n, Clopper-Pearson interval.
-
-        Args:
-            hits: Failing draws.
-            n: Draws.
-            confidence: Nominal coverage of the interval.
-            trace: Levels of the run.
-            no_outcome_share: Share of the hits that are points without an outcome.
-        """
+        """Return the outcome of n independent draws of which `hits` fail, a share of them without an outcome."""
         return cls(
             p=hits / n,
             interval=clopper_pearson(hits, n, confidence),
@@ -365,14 +357,10 @@ STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERG
 def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     """Return R independent runs as one: pooled counts, or their mean with a t interval.
 
-    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer
-    run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would ignore that the
-    spread of binomial counts is known; with R = 2 its quantile is 12.7.)
-
-    Otherwise p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not), with the c.o.v. of
-    `combined_cov` and the interval of `_mean_interval`. Runs that were stopped before their end are left out of the
-    mean if any run came to its end: one that has not reached the failures has p-hat = 0, which is no estimate. Their
-    levels stay in the trace.
+    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer run, with the
+    Clopper-Pearson interval: a t interval would ignore that the spread of counts is known. Otherwise p is the mean of
+    p-hat (unbiased; its logarithm is not). Runs that were stopped before their end are left out of the mean if any run
+    came to its end: one that has not reached the failures has p-hat = 0. Their levels stay in the trace.
     """
     if len(outcomes) == 1:
         return outcomes[0]

@@ -27,11 +27,6 @@ def is_number(value: object) -> TypeGuard[float]:
     return not isinstance(value, int) or abs(value) <= sys.float_info.max
 
 
-def is_whole(value: object, least: int) -> TypeGuard[int]:
-    """Return whether value is a whole number (a bool is none) of at least `least`."""
-    return not isinstance(value, bool) and isinstance(value, int | np.integer) and bool(value >= least)
-
-
 def check_number(name: str, value: object, low: float, high: float) -> None:
     """Raise a ValueError unless value is a number between low and high, both excluded."""
     if not is_number(value) or not low < value < high:
@@ -42,7 +37,7 @@ def check_number(name: str, value: object, low: float, high: float) -> None:
 
 def check_whole(name: str, value: object, least: int) -> None:
     """Raise a ValueError unless value is a whole number of at least `least`."""
-    if not is_whole(value, least):
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"Expected {name} to be a whole number of at least {least}, got {value!r}.")
 
 
@@ -263,11 +258,6 @@ class TermGradients:
     """Simulations that they took, all rows together."""
 
 
-def condition_of(problem: Inputs) -> str:
-    """Return what a problem holds fixed, in words; empty for nothing."""
-    return str(getattr(problem, "given", ""))  # a user's object
-
-
 def names_of_columns(problem: Inputs) -> tuple[str, ...]:
     """Return the names of the d columns of x, empty for none; raise a ValueError unless they are d different ones."""
     names = tuple(getattr(problem, "column_names", ()))  # a user's object
@@ -319,50 +309,35 @@ class FunctionProblem:
     """Any vectorised function, under N(0, I) or another base distribution.
 
     Args:
-        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. It may be left out where there are
-            `terms`: it is then their least. See `vectorized` for an f of one point.
+        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. Left out where there are `terms`.
         dim: Number of dimensions d; may be left out where the base has one.
-        terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system that fails
-            where one of its parts does; None for none. The problem's own `terms` gives `Terms`.
+        terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system; None for
+            none. The problem's own `terms` gives `Terms`.
         gradient: Maps points of shape (n, d) and the numbers of their terms, shape (n,), to the gradients of these
             terms, shape (n, d); None for none. The problem's own `gradient` gives `TermGradients`.
         gradient_cost: Simulations that a row of `gradient` counts as.
         vectorized: False where f maps one point of shape (d,) to a number, as a program does that simulates one drive.
-        chunk_size: Rows that workers get at once (`estimate(..., workers=2)`); None for 16, and for 1 of an f of one
-            point.
+        chunk_size: Rows that workers get at once; None for 16, and for 1 of an f of one point.
         base: Distribution of X: N(0, I) by default, a `Distribution`, or what `as_distribution` takes: a frozen
             distribution of SciPy (of one coordinate: all `dim` have it), one of OpenTURNS, or a list of them.
-        column_names: Names of the columns of x, for tables; those of the description of an OpenTURNS distribution by
-            default.
+        column_names: Names of the columns of x, for tables; by default those of an OpenTURNS distribution.
 
     Raises:
-        ValueError: If f, terms or gradient is not callable, f and terms are missing both, dim is not a positive
-            whole number, or base does not fit.
+        ValueError: If an argument is not as described, or f and terms are missing both.
 
     Example:
         >>> import numpy as np, samplers
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> problem.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
         array([ 2., -1.])
-
-        An f of one point, such as a simulation of one drive:
-
-        >>> drive = samplers.FunctionProblem(lambda x: 3.0 - x[0], dim=2, vectorized=False)
+        >>> drive = samplers.FunctionProblem(lambda x: 3.0 - x[0], dim=2, vectorized=False)  # one point
         >>> drive.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
         array([ 2., -1.])
-
-        Other distributions, here of SciPy:
-
         >>> from scipy import stats
         >>> strength, load = stats.lognorm(0.1, scale=9.0), stats.gumbel_r(3.0)
         >>> samplers.FunctionProblem(lambda x: x[:, 0] - x[:, 1], base=[strength, load])
         <FunctionProblem of <lambda>, 2 dimensions, base IndependentDistributions>
-
-        A series system, which fails where either coordinate exceeds 3:
-
-        >>> series = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
-        >>> series.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
-        array([ 2., -1.])
+        >>> series = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)  # fails where either coordinate exceeds 3
         >>> series.terms(np.array([[4.0, 0.0]])).values
         array([[-1.,  3.]])
     """

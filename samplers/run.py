@@ -39,7 +39,6 @@ from samplers.problem import (
     check_name,
     check_number,
     check_whole,
-    condition_of,
     describe_point,
     names_of_columns,
     one_per_row,
@@ -118,16 +117,6 @@ class RunArguments:
         if self.seed is not None:
             check_whole("seed", self.seed, 0)
         check_name("on_error", self.on_error, list(ON_ERROR))
-
-    @property
-    def goal(self) -> Goal:
-        """The goal of all replicates together."""
-        return Goal(
-            gamma=float(self.gamma),
-            confidence=float(self.confidence),
-            max_sim=None if self.max_sim is None else int(self.max_sim),
-            target_cov=None if self.target_cov is None else float(self.target_cov),
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,10 +231,17 @@ class Run:
         if not isinstance(method, Stepping):
             raise ValueError(f"Expected a method such as MonteCarlo(), got {method!r}.")
         self._inputs = InputsOnly(int(problem.dim), problem.base, offer)
-        self._given, self._column_names = condition_of(problem), names_of_columns(problem)
-        self._goal, self._on_error = arguments.goal, arguments.on_error
+        self._given, self._column_names = str(getattr(problem, "given", "")), names_of_columns(problem)
+        max_sim, target_cov = arguments.max_sim, arguments.target_cov
+        self._goal = Goal(  # of all replicates together
+            gamma=float(arguments.gamma),
+            confidence=float(arguments.confidence),
+            max_sim=None if max_sim is None else int(max_sim),
+            target_cov=None if target_cov is None else float(target_cov),
+        )
         self._seed, self._n_wanted = choose_seed(arguments.seed), int(arguments.replicates)
-        shares = split_budget(self._goal.max_sim, self._n_wanted)
+        self._on_error, n = arguments.on_error, self._n_wanted
+        shares = [None if max_sim is None else max_sim * (i + 1) // n - max_sim * i // n for i in range(n)]
         choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own; by the smallest share
         goal = replace(self._goal, max_sim=shares[0])
         self._choice: Choice = Choice(method) if choose is None else choose(self._inputs, goal)
@@ -258,8 +254,8 @@ class Run:
         self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
-        for max_sim in shares:
-            self._start_replicate(max_sim)
+        for share in shares:
+            self._start_replicate(share)
         self._start_more_for_target()
 
     @property
@@ -443,13 +439,6 @@ class Run:
         while self.done and needs_another(self._replicates, self._choice.method, self._goal, self._n_wanted):
             max_sim = self._goal.max_sim
             self._start_replicate(None if max_sim is None else max_sim - self._n_sim)
-
-
-def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:
-    """Return each replicate's part of max_sim; they differ by 1 at most and add up to it."""
-    if max_sim is None:
-        return [None] * replicates
-    return [max_sim * (i + 1) // replicates - max_sim * i // replicates for i in range(replicates)]
 
 
 def meets_target(outcomes: Sequence[Outcome], target_cov: float | None, replicates: int) -> bool:

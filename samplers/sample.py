@@ -96,18 +96,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Layer:
-    """All points of one level, and the thresholds g for which they estimate P[f(X) <= g]: low <= g < high.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
-        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(n=1000), seed=0)
-        >>> for layer in result.sample.layers:
-        ...     print(f"{len(layer.f)} points for {layer.low:.1f} <= g < {layer.high:.1f}")
-        1000 points for 1.8 <= g < inf
-        1000 points for 0.7 <= g < 1.8
-        1000 points for -inf <= g < 0.7
-    """
+    """All points of one level, and the thresholds g for which they estimate P[f(X) <= g]: low <= g < high."""
 
     f: FloatArray
     """Outcomes, shape (m,)."""
@@ -187,13 +176,7 @@ class Sample:
 
     @classmethod
     def of_equal_draws(cls, f: FloatArray, x: FloatArray) -> Sample:
-        """Return n independent draws of equal weight, outcomes f (n,), of which x (k, d) are the failing ones.
-
-        Example:
-            >>> import numpy as np, samplers
-            >>> samplers.Sample.of_equal_draws(np.array([2.0, -1.0]), np.array([[0.5, 3.0]])).weights
-            array([0.5, 0.5])
-        """
+        """Return n independent draws of equal weight, outcomes f (n,), of which x (k, d) are the failing ones."""
         n = len(f)
         return cls(f=f, weights=np.broadcast_to(1 / n, n), units=np.arange(n), n_units=n, x=x)
 
@@ -208,15 +191,7 @@ class SimulationRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPoints:
-    """All simulations of a run in the order of their making.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> result = samplers.estimate(problem, "ss", seed=0, keep_points=True)
-        >>> len(result.points.f) == result.n_sim, result.points.x.shape[1]
-        (True, 2)
-    """
+    """All simulations of a run in the order of their making."""
 
     x: FloatArray
     """Points, shape (n, d), in physical space."""
@@ -231,15 +206,7 @@ class SimulatedPoints:
 
 
 class Failure(NamedTuple):
-    """One failing point.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> failure = samplers.estimate(problem, seed=0, max_sim=2000).failures[0]
-        >>> failure.x.shape, bool(failure.f <= 0.0), round(failure.log_p0, 2)
-        ((2,), True, -6.36)
-    """
+    """One failing point."""
 
     x: FloatArray
     """The point, shape (d,)."""
@@ -355,18 +322,12 @@ def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
 
 
 def zero_hit_bound(n: int, confidence: float) -> float:
-    """Return the upper bound of a probability of which n independent draws showed nothing; 1 where n = 0.
-
-    The one-sided interval of Clopper and Pearson, with all of 1 - confidence at the upper end.
-    """
+    """Return the one-sided Clopper-Pearson bound of a probability of which n draws showed nothing; 1 for n = 0."""
     return -math.expm1(math.log1p(-confidence) / n) if n else 1.0
 
 
 def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
-    """Return p exp(-+ q s), s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile.
-
-    For estimators whose logarithm is nearly normal; p must be positive. Cut at 1.
-    """
+    """Return p exp(-+ q s), p > 0, s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile; at most 1."""
     quantile = float(stdtrit(df, 0.5 + confidence / 2))
     half = quantile * math.sqrt(math.log1p(cov * cov))
     return p * math.exp(-half), min(1.0, p * math.exp(half))
@@ -385,11 +346,7 @@ def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -
 
 
 def degrees_of_freedom(ess: float, independent: bool) -> float:
-    """Return the degrees of freedom of a sum over `ess` effective units; inf where they are many.
-
-    Sums of chains have ess - 1, as in subset simulation; single draws, whose weights are skewed, a quarter of ess
-    but at least 3, as in importance sampling.
-    """
+    """Return those of a sum over `ess` units; inf for many. Single draws, whose weights are skewed, have a quarter."""
     if ess > LARGE_ESS:
         return math.inf
     return max(ess / 4, 3.0) if independent else max(ess - 1, 1.0)
@@ -401,10 +358,7 @@ def binomial_cov(p: float, n: float) -> float:
 
 
 def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
-    """Return Monte Carlo runs for the same c.o.v. divided by n_sim.
-
-    NaN where p is 0 or 1, and from a c.o.v. of 1 on: p itself is then not known.
-    """
+    """Return Monte Carlo runs for the same c.o.v. over n_sim; NaN where p is 0, 1 or not known (c.o.v. from 1 on)."""
     if not 0 < p < 1 or not 0 < cov < 1 or n_sim == 0:
         return math.nan
     return (1 - p) / (p * cov * cov * n_sim)
@@ -413,10 +367,8 @@ def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
 def correlation_factor(inside: NDArray[np.bool_], lengths: NDArray[np.int64]) -> float:
     """Return Au and Beck's gamma of an indicator (chains, steps), row i chain i in time order.
 
-    Correlation in the chains raises a variance by 1 + gamma,
-    gamma = 2 sum_k (M_k / N) rho(k), with M_k the number of pairs at lag k inside the chains, whose `lengths` (chains,)
-    count, N the number of points and rho(k) the correlation of the indicator at lag k. With chains of equal length L
-    this is the paper's 2 sum_k (1 - k / L) rho(k). Negative sums, which are sampling noise, count as 0.
+    Correlation in chains of these lengths (chains,) raises a variance by 1 + gamma, gamma = 2 sum_k (M_k / N) rho(k),
+    with M_k the pairs at lag k, N the points and rho(k) the correlation at lag k. Negative sums count as 0.
     """
     used = np.arange(inside.shape[1]) < lengths[:, None]
     total = int(used.sum())
@@ -439,10 +391,9 @@ MAX_TIED_SHARE = 0.5
 def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
     """Return the next threshold for outcomes f (n,), or None if there is none to go to.
 
-    gamma as soon as the fraction is reached by f <= gamma: the answer is then known. Otherwise the `fraction` quantile
-    q, an outcome that occurred, so that the share of f <= q is its true share. Where many outcomes tie at q (time to
-    collision capped for most scenarios), the share of f <= q may be far above `fraction`. Then the largest distinct
-    outcome below q is taken if its share is nearer (in ratio) or if q would keep more than half of the points.
+    gamma as soon as the fraction is reached by f <= gamma. Otherwise the `fraction` quantile q, an outcome that
+    occurred. Where many outcomes tie at q, the largest distinct outcome below q is taken if its share is nearer (in
+    ratio) or if q would keep more than half of the points.
     """
     n = len(f)
     wanted = fraction * n
@@ -466,11 +417,9 @@ QUANTILES = 400
 def add_unseen(p: float, high: float, lineages: float, confidence: float) -> float:
     """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages.
 
-    Let nu independent lineages have reached failure, all of them in the regions that are known. The share M of p in
-    other regions has then the distribution Beta(1/10, nu): each lineage is a trial that a region of share M is missed
-    with probability 1 - M; the first parameter is small because most problems have no other region. With
-    p-hat exp(s Z) the probability of the regions known, Z ~ N(0, 1), the end is the quantile of
-    p-hat exp(s Z) / (1 - M).
+    Of nu independent lineages that reached failure, all in the regions known, each is a trial that a region of share M
+    is missed with probability 1 - M: M ~ Beta(1/10, nu), since most problems have no other region. The end is the
+    quantile of p-hat exp(s Z) / (1 - M), with p-hat exp(s Z) the probability of the regions known, Z ~ N(0, 1).
     """
     if not 0 < p < high or np.isinf(lineages):
         return high

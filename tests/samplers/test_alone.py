@@ -12,7 +12,6 @@ import pytest
 
 import samplers
 from samplers.methods.blocks import project_mean
-from samplers.problem import needs_library
 
 SCRIPT = Path(__file__).with_name("without_drivers.py")
 ROOT = Path(__file__).parents[2]
@@ -66,17 +65,6 @@ def test_the_command_line_needs_no_posix(tmp_path: Path) -> None:
     words = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", "500", "--out", "run")
     assert "P[f <= 0]" in run_without_posix(tmp_path, *words)
     assert (tmp_path / "run" / "result.json").is_file()
-
-
-def test_another_missing_module_is_an_error_of_its_own() -> None:
-    with pytest.raises(ModuleNotFoundError, match="no_such_part"), needs_library("numpy", "This test"):
-        __import__("no_such_part")
-
-
-def test_what_is_installed_is_imported() -> None:
-    with needs_library("numpy", "This test"):
-        import numpy as again
-    assert again is np
 
 
 @pytest.mark.parametrize("library", ["matplotlib", "pyarrow", "pandas", "cvxpy"])

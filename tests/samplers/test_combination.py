@@ -75,13 +75,6 @@ def test_pooled_counts_weigh_draws_not_runs():
     assert combine([few, replace(many, counts=None)], 0.95).p == pytest.approx((1 / 100 + 3 / 900) / 2)
 
 
-@pytest.mark.slow
-def test_coverage_of_replicated_runs(study):
-    runs = 60
-    found = study(half_space(2, 3.0), samplers.AdaptiveSubsetSimulation(n=500), runs, replicates=6)
-    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.93)
-
-
 def sample(f, weights, first_x, n_units=None):
     f = np.array(f, dtype=float)
     n_units = len(f) if n_units is None else n_units

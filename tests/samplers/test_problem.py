@@ -90,19 +90,6 @@ def test_an_f_that_returns_a_column_is_told_to_take_it():
         ragged.evaluate(np.zeros((2, 2)))
 
 
-def test_an_f_of_batches_that_raises_gets_none():
-    def f(x):
-        if (x[..., 0] > 1.0).any():
-            raise ValueError("off the map")
-        return x.sum(axis=-1)
-
-    problem = samplers.FunctionProblem(f, dim=2)
-    with pytest.raises(samplers.EvaluationError, match="off the map") as error:
-        samplers.estimate(problem, "mc", seed=0, max_sim=100)
-    assert "vectorized" not in str(error.value)
-    assert samplers.estimate(problem, "mc", seed=0, max_sim=100, on_error="failure").p > 0.1
-
-
 @pytest.mark.parametrize("names", [["a"], ["a", "a"], ["a", 1]])
 def test_names_of_columns_that_do_not_fit_are_refused(names):
     with pytest.raises(ValueError, match="2 different names, got"):

@@ -34,14 +34,9 @@ def test_to_dict_is_plain_json():
     assert data["method"]["settings"]["n"] == 1000
     assert len(data["trace"]) == len(estimate.trace)
     assert data["failures"]["total"] == estimate.failures.total
-
-
-def test_to_dict_has_no_infinities():
     never = samplers.FunctionProblem(lambda x: np.ones(len(x)), 1)
-    data = samplers.estimate(never, "mc", seed=1, max_sim=100).to_dict()
-    assert data["cov"] is None
-    assert data["gain"] is None
-    json.dumps(data, allow_nan=False)
+    data = json.loads(samplers.estimate(never, "mc", seed=1, max_sim=100).to_json())
+    assert data["cov"] is None and data["gain"] is None  # no infinities
 
 
 def test_says_how_large_a_region_may_have_been_missed():
@@ -102,37 +97,6 @@ def test_counts_base_draws_of_search_and_estimate(method, expected):
     assert samplers.estimate(half_space().problem, method, seed=1).base_draws == expected
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["two-stage", "ce"])
-def test_a_region_as_large_as_said_is_rarely_missed(method):
-    """A sliver that nothing leads to, beside a half-space: it is seen unless all base draws miss it."""
-    missed = 0
-    for seed in range(100):
-        seen = []
-
-        def f(x, seen=seen):
-            sliver = np.abs(x[:, 0] + 0.5) < 0.006  # p = 0.0042
-            seen.append(sliver.any())
-            return np.where(sliver, -1.0, 3.5 - x[:, 0])
-
-        unseen = samplers.estimate(samplers.FunctionProblem(f, 2), method, seed=seed, max_sim=6000).unseen
-        assert unseen < 0.006
-        missed += not any(seen)
-    assert missed <= 10
-
-
-def test_failures_read_as_arrays_and_one_by_one():
-    failures = estimate_adss().failures
-    assert failures.x.shape == (len(failures), 2)
-    assert (failures.f <= 0).all()
-    assert (np.diff(failures.log_p0) <= 0).all()
-    x, f, log_p0 = failures[0]
-    np.testing.assert_array_equal(x, failures.x[0])
-    assert f == failures.f[0]
-    assert log_p0 == max(failure.log_p0 for failure in failures)
-    assert failures != estimate_adss(gamma=0.1).failures
-
-
 def test_an_estimate_comes_back_from_its_file(tmp_path):
     found = estimate_adss(replicates=2)
     found.save(tmp_path / "result")
@@ -162,6 +126,9 @@ def test_the_most_likely_failures_are_kept_a_thousand_of_them(recorder):
     nearest = np.sort(np.abs(f.points[:, 0]))[:1000]
     np.testing.assert_array_equal(np.abs(found.x[:, 0]), nearest)
     assert (len(found), found.total) == (1000, 5000)
+    assert (np.diff(found.log_p0) <= 0).all()
+    x, value, log_p0 = found[0]
+    assert (x[0], value, log_p0) == (found.x[0, 0], found.f[0], max(failure.log_p0 for failure in found))
 
 
 matplotlib.use("Agg")
@@ -185,13 +152,6 @@ def test_a_path_is_written_and_leaves_no_figure_open(result: samplers.Estimate, 
     sensitivity = result.sensitivity(["a", "b"])
     assert len(sensitivity.plot(tmp_path / "sensitivity.png")) == 2
     assert (tmp_path / "sensitivity.png").read_bytes().startswith(PNG)
-
-
-def test_given_axes_and_the_current_ones_are_used(result: samplers.Estimate) -> None:
-    figure, given = pyplot.subplots()
-    assert result.plot(given) is given
-    assert result.plot(ax=None) is pyplot.gca()
-    pyplot.close(figure)
 
 
 @pytest.mark.parametrize("wrong", [3.0, np.zeros(2), b"p.png"])
@@ -302,11 +262,8 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         read_object(tmp_path / "thing", samplers.Level)
     with pytest.raises(FileNotFoundError, match="no file"):
         read_object(tmp_path / "nothing", Thing)
-
-
-def test_a_folder_in_place_of_the_file_is_named(tmp_path):
     with pytest.raises(OSError, match=r"Cannot write '.*': "):
-        write_object(tmp_path, Thing(1))
+        write_object(tmp_path, Thing(1))  # a folder
 
 
 class Other(samplers.Method):

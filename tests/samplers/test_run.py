@@ -50,43 +50,29 @@ def test_every_argument_of_estimate_is_taken():
     assert told != finished(samplers.MonteCarlo(batch=50).start(Places(), **{**options, "target_cov": 0.1}))
 
 
-def test_the_same_batch_until_it_is_told():
-    run = samplers.MonteCarlo(batch=100).start(Places(), seed=1)
-    first = run.ask()
-    first_again = run.ask()
-    np.testing.assert_array_equal(first, first_again)
-    first[:] = 99.0  # what the caller does with them is the caller's business
-    np.testing.assert_array_equal(run.ask(), first_again)
-    run.tell(EASY.f(first_again))
-    assert not np.array_equal(run.ask()[:2], first_again[:2])
-
-
-def test_a_wrong_answer_can_be_told_again():
-    run = samplers.MonteCarlo(n=5).start(Places(), seed=1)
-    x = run.ask()
-    for wrong in (x[:-1, 0], x, 1.0, [np.nan] * 5, None):
-        with pytest.raises(EvaluationError, match=r"Expected f to return shape \(5,\)|NaN for row 0"):
-            run.tell(wrong)
-    run.tell(list(x[:, 0]))
-    assert run.done
-    assert run.result().n_sim == 5
-
-
-def test_what_is_asked_in_the_wrong_order():
+def test_the_same_batch_until_it_is_told_right():
     run = samplers.MonteCarlo(n=5, batch=3).start(Places(), seed=1)
     with pytest.raises(RuntimeError, match=r"call ask\(\)"):
         run.tell([1.0] * 3)
-    run.tell(run.ask()[:, 0])
+    first, again = run.ask(), run.ask()
+    np.testing.assert_array_equal(first, again)
+    first[:] = 99.0  # what the caller does with them is the caller's business
+    np.testing.assert_array_equal(run.ask(), again)
+    for wrong in (again[:-1, 0], again, 1.0, [np.nan] * 3, None):
+        with pytest.raises(EvaluationError, match=r"Expected f to return shape \(3,\)|NaN for row 0"):
+            run.tell(wrong)
+    run.tell(list(again[:, 0]))
     with pytest.raises(RuntimeError, match=r"call ask\(\)"):
         run.tell([1.0] * 2)
     run.tell(run.ask()[:, 0])
+    assert run.done and run.result().n_sim == 5
     with pytest.raises(RuntimeError, match="done"):
         run.ask()
-    with pytest.raises(RuntimeError, match=r"call ask\(\)"):
-        run.tell([1.0])
 
 
 def test_progress_and_a_result_at_any_moment():
+    unknown = samplers.MonteCarlo().start(Places(), seed=1, replicates=3).result()
+    assert (unknown.p, unknown.interval, unknown.cov, unknown.status) == (0.0, (0.0, 1.0), math.inf, "stopped")
     run = samplers.MonteCarlo(batch=10).start(Places(), max_sim=100, seed=1)
     assert (run.progress.n_sim, run.progress.max_sim) == (0, 100)
     run.tell(EASY.f(run.ask()))
@@ -96,15 +82,6 @@ def test_progress_and_a_result_at_any_moment():
     assert any("Stopped after 10 simulations" in text for text in result.warnings)
     assert run.done
     assert run.result() == result
-
-
-def test_stopped_before_anything_was_told():
-    run = samplers.MonteCarlo().start(Places(), seed=1, replicates=3)
-    run.ask()
-    result = run.result()
-    assert (result.p, result.interval, result.cov, result.n_sim) == (0.0, (0.0, 1.0), math.inf, 0)
-    assert result.status == "stopped"
-    assert math.isnan(result.gain)
 
 
 class Batches(samplers.Method):
@@ -175,9 +152,7 @@ def one_after_another(drive, problem, method, seed, replicates, max_sim):
     return combine([drive(method.steps(problem, goal, rng), problem).value for rng in rngs], 0.95)
 
 
-@pytest.mark.parametrize(
-    ("method", "max_sim"), [("adss", None), ("ce", 6000), ("ice", None), ("mc", 6000), ("two-stage", 6000)]
-)
+@pytest.mark.parametrize(("method", "max_sim"), [("adss", None), ("mc", 6000), ("two-stage", 6000)])
 def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recorder, drive):
     problem, chosen = half_space(3, 3.0).problem, samplers.get_method(method)
     alone, together = (recorder(problem.f) for _ in range(2))
@@ -250,12 +225,6 @@ def test_a_rest_of_max_sim_is_used_where_runs_pool(pools, n_sim):
     assert result.n_sim == n_sim
 
 
-def test_a_target_out_of_reach_is_given_up_at_the_limit_of_the_method():
-    method = samplers.MonteCarlo(n=1000)
-    result = samplers.estimate(half_space().problem, method, seed=1, target_cov=0.01, replicates=3)
-    assert result.n_sim == 3000
-
-
 def stopped_after(batches, method, **options):
     """The result of a run that is stopped after so many batches, and the run."""
     problem = half_space(2, 2.0).problem
@@ -263,14 +232,6 @@ def stopped_after(batches, method, **options):
     for _ in range(batches):
         run.tell(problem.evaluate(run.ask()))
     return run.result()
-
-
-def test_replicates_stopped_on_their_way():
-    result = stopped_after(2, samplers.MonteCarlo(batch=100), replicates=3, max_sim=5000)
-    assert (result.n_sim, result.status) == (600, "stopped")
-    assert result.p == result.failures.total / 600
-    assert result.interval == clopper_pearson(result.failures.total, 600, 0.95)
-    assert len(result.sample.f) == 600
 
 
 def test_stopped_while_further_runs_are_made_for_the_target():
@@ -302,7 +263,7 @@ class StopsAt:
         return 2.0 - x[:, 0]
 
 
-@pytest.mark.parametrize("method", ["mc", "two-stage", "adss"])
+@pytest.mark.parametrize("method", ["mc", "two-stage"])
 def test_an_interrupted_estimation_has_what_it_knows(method: str) -> None:
     with pytest.raises(EstimationInterrupted, match=r"Interrupted after [\d,]+ simulations") as caught:
         samplers.estimate(samplers.FunctionProblem(StopsAt(3), 2), method, seed=1, max_sim=60_000, on_error="failure")
@@ -360,7 +321,7 @@ def test_other_threads_estimate_without_touching_signals() -> None:
     assert np.isfinite(results[0].p)
 
 
-@pytest.mark.parametrize("method", ["mc", "adss", "two-stage"])
+@pytest.mark.parametrize("method", ["mc", "two-stage"])
 def test_listener_is_told_of_simulations_levels_and_p(method):
     seen = []
     problem = half_space().problem
@@ -399,25 +360,6 @@ def failing_in_mid_run(x):
     return 5.0 - x[:, 0]
 
 
-def on_screen(written):
-    """What a terminal shows after these characters, line by line."""
-    lines, row, column = [""], 0, 0
-    for part in re.findall(r"\x1b\[[0-9;?]*[a-zA-Z]|\r|\n|[^\x1b\r\n]+", written):
-        if part == "\r":
-            column = 0
-        elif part == "\n":
-            row, column = row + 1, 0
-            lines += [""] * (row + 1 - len(lines))
-        elif part == "\x1b[2K":
-            lines[row] = ""
-        elif part.startswith("\x1b["):
-            row -= int(part[2:-1] or 1) if part.endswith("A") else 0
-        else:
-            lines[row] = lines[row][:column].ljust(column) + part + lines[row][column + len(part) :]
-            column += len(part)
-    return [line for line in lines if line.strip()]
-
-
 @pytest.mark.parametrize("terminal", [False, True])
 def test_bar_of_a_run_that_fails_leaves_nothing(capsys, monkeypatch, terminal):
     monkeypatch.setenv("TERM", "xterm")
@@ -428,9 +370,8 @@ def test_bar_of_a_run_that_fails_leaves_nothing(capsys, monkeypatch, terminal):
         samplers.estimate(problem, samplers.MonteCarlo(batch=100), seed=1, progress=True)
     out, err = capsys.readouterr()
     assert out == ""
-    assert ("simulations" in err) == terminal  # it was there
-    assert on_screen(err) == []
-    assert terminal or err == ""
-
-    result = samplers.estimate(half_space().problem, "adss", seed=1, progress=True)
-    assert f"{result.n_sim:,} simulations" in on_screen(capsys.readouterr().err)[0]
+    if not terminal:
+        assert err == ""
+    else:  # what was there is erased, and nothing is written after that
+        assert "simulations" in err
+        assert err.endswith("\x1b[2K")

@@ -82,15 +82,6 @@ def test_every_simulated_point_is_there_with_its_outcome(method):
     np.testing.assert_array_equal(PROBLEM.evaluate(x), result.points.f)
 
 
-def test_without_them_failing_points_have_their_coordinates():
-    result = samplers.estimate(PROBLEM, "mc", seed=0, max_sim=5000)
-    table = result.to_pandas(["a", "b"])
-    assert len(table) == 5000
-    assert table.weight[table.failed].sum() == pytest.approx(result.p)
-    assert (table.a[table.failed] >= 3.0).all()
-    assert table.a[~table.failed].isna().all()
-
-
 def test_simulations_without_an_outcome_are_null():
     def f(x):
         return np.where(x[:, 1] > 2.0, np.nan, 3.0 - x[:, 0])
@@ -120,9 +111,3 @@ def test_columns_are_named_by_the_problem():
         assert result.to_arrow().column_names[-2:] == ["load", "x.f"]
         assert result.to_arrow(["a", "b"]).column_names[-2:] == ["a", "b"]
     assert [each.name for each in result.sensitivity().columns] == ["load", "f"]
-
-
-def test_names_outlive_a_file(tmp_path):
-    named = samplers.FunctionProblem(PROBLEM.f, dim=2, column_names=["load", "wind"])
-    samplers.estimate(named, "mc", seed=0, max_sim=500).save(tmp_path / "result")
-    assert samplers.Estimate.load(tmp_path / "result").column_names == ("load", "wind")
