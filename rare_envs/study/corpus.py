@@ -130,11 +130,7 @@ def _is_number(value: object) -> bool:
 
 
 def read_corpus(folder: Path) -> list[StoredFailure]:
-    """Read a corpus, in the order of its files' names.
-
-    Raises:
-        BadInput: There is none, or one of its files is damaged.
-    """
+    """Read a corpus, in the order of its files' names; a BadInput if there is none, or a file is damaged."""
     paths = sorted(folder.glob("*.json"))
     if not paths:
         raise BadInput(f"There is no corpus in {str(folder)!r}: rare-envs corpus add RUN makes one.")
@@ -162,20 +158,7 @@ def list_failures(run: LoadedStudy, trust: bool = False) -> list[StoredFailure]:
 
 
 def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tuple[list[StoredFailure], int]:
-    """Add failures of a run to a corpus; those that it has already stay as they are.
-
-    Args:
-        run: Folder of `rare-envs estimate --out`.
-        corpus: Folder of the corpus; is made, if need be.
-        most: Number of failures, the most likely ones and one of each kind of crash and each mode.
-        trust: Trust the code that a run from elsewhere names.
-
-    Returns:
-        The failures, and how many of them are new.
-
-    Raises:
-        BadInput: There is no such run, or the corpus cannot be written.
-    """
+    """Add the `most` likely failures of a run to a corpus, and return them and how many of them are new."""
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
     study = load_finished(run)
@@ -254,24 +237,7 @@ def try_ego(
     action: str | None = None,
     trust: bool = False,
 ) -> tuple[list[Trial], float]:
-    """Drive an ego through stored scenarios, those of one world side by side.
-
-    Args:
-        failures: The scenarios.
-        folder: Where they are from, for messages.
-        ego: The ego, as fields of `Question` name it and its interface, in the four arguments that follow too.
-        algo: Algorithm of its `.zip`.
-        stats: File of its `VecNormalize` statistics.
-        observation: What it observes.
-        action: What it answers.
-        trust: Let the ego's file run code, and code that the scenarios name.
-
-    Returns:
-        A trial of each, in their order, and the wall time of all [s].
-
-    Raises:
-        BadInput: The ego cannot be used, or a scenario is not one of its world any longer.
-    """
+    """Return a trial of an ego in each of some scenarios from a folder, and the wall time of all [s]."""
     worlds: dict[str, list[int]] = {}
     for number, failure in enumerate(failures):
         worlds.setdefault(json.dumps(failure.question_values(), sort_keys=True), []).append(number)

@@ -27,18 +27,8 @@ from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
 from rare_envs.startup import __version__
-from rare_envs.study import writing
-from rare_envs.study.arguments import (
-    FIRST_BATCH,
-    BadInput,
-    Question,
-    RunInterrupted,
-    UnwrittenResults,
-    as_bad_input,
-    describe_stop,
-    keep_answer,
-    output_folder,
-)
+from rare_envs.study import arguments, writing
+from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures
 from rare_envs.study.question import Study, build_problem, digest_files, find_changed_files, open_question, prepare
@@ -116,27 +106,28 @@ def run(
         evaluator.watchers += [keeper.keep, table.add]
         try:
             check_base(study.problem)
-            arguments, run = study.question.run_arguments, partial(run_method, evaluator, progress=progress)
+            wanted, run = study.question.run_arguments, partial(run_method, evaluator, progress=progress)
             with evaluator:
-                estimate = run(evaluator, study.method, arguments)
+                estimate = run(evaluator, study.method, wanted)
                 if study.question.ensemble_run:
-                    estimate = add_ensemble_run(estimate, evaluator, study.method, arguments, run)
+                    estimate = add_ensemble_run(estimate, evaluator, study.method, wanted, run)
             report = report_on(estimate)
         except EgoGone as error:
             raise BadInput(f"{error}{advice}") from error
         except (ValueError, ExecutorError) as error:
             raise BadInput(error) from error
         except samplers.EstimationInterrupted as stopped:
-            raise RunInterrupted(f"{describe_stop(stopped.estimate)}{advice}", report_on(stopped.estimate)) from None
+            known = f"{arguments.describe_stop(stopped.estimate)}{advice}"
+            raise RunInterrupted(known, report_on(stopped.estimate)) from None
         except KeyboardInterrupt:
             made = f"{evaluator.n_made:,} simulations made, {evaluator.n_failed:,} of them failed.{advice}"
             known = made if evaluator.n_made else "no simulation made."
             raise RunInterrupted(f"Stopped: no estimate yet, {known}") from None
-        with keep_answer(report):
+        with arguments.keep_answer(report):
             estimate, kinds = classify_failures(study.problem, report.estimate)
             report = replace(report, estimate=estimate, kinds=kinds)
             table.write(estimate, kinds.by_scenario)
-    with keep_answer(report):
+    with arguments.keep_answer(report):
         return replace(report, repeatability=recheck(study, keeper), lost=table.lost)
 
 
@@ -302,7 +293,7 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
     try:
         report = run(study, progress, journal, executor, target)
         report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
-        with keep_answer(report):
+        with arguments.keep_answer(report):
             writing.finish_run(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{kept(error.report)}", error.report) from error
@@ -349,9 +340,9 @@ def compare_egos(
                 method = studies["A"].method
                 found = samplers.compare(evaluators["A"], evaluators["B"], method, progress=progress, **asked)
         except samplers.EstimationInterrupted as stopped:
-            raise RunInterrupted(describe_stop(stopped.estimate, "P[A or B fails]")) from None
+            raise RunInterrupted(arguments.describe_stop(stopped.estimate, "P[A or B fails]")) from None
         except KeyboardInterrupt:
-            raise RunInterrupted(FIRST_BATCH) from None
+            raise RunInterrupted(arguments.FIRST_BATCH) from None
         checks = {name: recheck(study, kept[name]) for name, study in studies.items()}
         doubts = [f"{name}: {check.warning}" for name, check in checks.items() if check is not None and check.warning]
         found = replace(found, warnings=(*found.warnings, *doubts))

@@ -36,8 +36,6 @@ from rare_envs.traffic.road import ReferenceLine, Road, list_cells
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from samplers.problem import FloatArray
 
-__all__ = ["EXPORT_FORMATS", "export_drive", "export_scenario"]
-
 EXPORT_FORMATS = {
     "openscenario": "ASAM OpenSCENARIO XML 1.2 (.xosc) with its road as OpenDRIVE 1.6 (.xodr) beside it",
     "carla": "the same in OpenSCENARIO 1.0 for CARLA's scenario_runner, with a free ego",
@@ -56,13 +54,22 @@ def export_scenario(
     format: str = "openscenario",
     ego: Literal["recorded", "free"] | None = None,
 ) -> tuple[Path, ...]:
-    """Drive a scenario x (d,) of a problem and write it for other simulators; see `export_drive`.
+    """Drive a scenario x (d,) of a problem and write it for other simulators.
+
+    Args:
+        problem: The world and its ego.
+        x: Scenario parameters, shape (d,).
+        path: The file: `.xosc`, beside which the road is written as `.xodr`, or `.xml` for CommonRoad. Its folder is
+            made if there is none.
+        format: One of `EXPORT_FORMATS`.
+        ego: "recorded", the ego follows its trajectory as the others do; or "free", it is put to its place with its
+            speed, and whoever simulates drives it. None for "free" with CARLA and "recorded" otherwise.
 
     Returns:
         The files written.
 
     Raises:
-        ValueError: An argument is not as described, or a library is missing.
+        ValueError: An argument is not as described, or the library scenariogeneration is missing.
         OSError: A file cannot be written.
 
     Example:
@@ -90,33 +97,7 @@ def export_drive(
     ego: Literal["recorded", "free"] | None = None,
     properties: dict[str, str] | None = None,
 ) -> tuple[Path, ...]:
-    """Write a drive for other simulators.
-
-    Args:
-        drive: The drive.
-        path: The file: `.xosc`, beside which the road is written as `.xodr`, or `.xml` for CommonRoad. Its folder is
-            made if there is none.
-        format: One of `EXPORT_FORMATS`.
-        ego: "recorded", the ego follows its trajectory as the others do; or "free", it is put to its place with its
-            speed, and whoever simulates drives it. None for "free" with CARLA and "recorded" otherwise.
-        properties: For the header of OpenSCENARIO 1.2.
-
-    Returns:
-        The files written.
-
-    Raises:
-        ValueError: An argument is not as described, or the library scenariogeneration is missing.
-        OSError: A file cannot be written.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", horizon=1.0)
-        >>> drive = drive_again(problem, np.array([20.0, 15.0, 30.0]))
-        >>> with TemporaryDirectory() as folder:
-        ...     (file,) = export_drive(drive, Path(folder) / "drive.xml", "commonroad", ego="free")
-        ...     file.read_text().count("<dynamicObstacle")
-        1
-    """
+    """Write a drive as `export_scenario` does, with `properties` for the header of OpenSCENARIO 1.2."""
     path = Path(path)
     free = check_export(path, format, ego)
     trajectories, road = find_trajectories(drive), drive.road

@@ -27,19 +27,7 @@ from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.episodes import digest_scenarios, list_columns
 from rare_envs.traffic.crash import CRASH_KINDS, NONE, OTHERS, Crash, describe_crash
-from samplers.analysis import (
-    NO_OUTCOME_LABEL,
-    BaseUncertainty,
-    Exceedance,
-    FailureExpectation,
-    FurtherFailures,
-    WeightedFailures,
-    compute_exceedance,
-    expect_over_failures,
-    expect_under_refits,
-    sum_by_label,
-    weigh_failures,
-)
+from samplers import analysis
 from samplers.analysis.weighted import choose_failures, require_sample
 from samplers.method import EstimateData
 from samplers.output import drawing_axes
@@ -59,7 +47,7 @@ MAX_REPLAYED_FURTHER = 2_000
 class ReplayedFailures(NamedTuple):
     """Failing points of a run with their crashes."""
 
-    failures: WeightedFailures
+    failures: analysis.WeightedFailures
     """The points and their weights, those without an outcome included."""
     crash: Crash
     """Crashes of the points that have an outcome, in their order."""
@@ -82,7 +70,7 @@ def replay_failures(
         raise ValueError(f"{VARIES[0].upper()}{VARIES[1:]}.")
 
     def replay(run: EstimateData, most: int | None) -> ReplayedFailures:
-        failures = weigh_failures(run, most)
+        failures = analysis.weigh_failures(run, most)
         return ReplayedFailures(failures, problem.crashes(failures.x[failures.has_outcome]))
 
     own, further = replay(estimate, most), estimate.ensemble_run
@@ -102,14 +90,14 @@ SHOWN_THRESHOLDS = 3
 class Severity:
     """How severe the collisions among the failures of a run are."""
 
-    curve: Exceedance
+    curve: analysis.Exceedance
     """P[failure in a collision with delta-v > v] over v [m/s], with simultaneous bands of the sampling and, where the
     base has refits, of its events."""
     largest_delta_v: float
     """Largest delta-v among the failures that were simulated again [m/s]."""
-    injuries: FailureExpectation
+    injuries: analysis.FailureExpectation
     """Expected serious injuries per scenario, both vehicles together."""
-    injuries_base: BaseUncertainty | None
+    injuries_base: analysis.BaseUncertainty | None
     """Interval of the same that the events behind a fitted base distribution allow; None where it has no refits."""
     n_replayed: int
     """Failing scenarios that were simulated again for it; not in the run's n_sim."""
@@ -221,9 +209,9 @@ def compute_severity(
     """Return the severity of failures that were driven again; None where none of them is a collision."""
     failures, any_vehicle = replayed.failures, problem.world.measurement.collisions == "any"
     delta_v, injuries = replayed.severities(any_vehicle)
-    more: list[FurtherFailures | None] = [None, None]
+    more: list[analysis.FurtherFailures | None] = [None, None]
     if further is not None:
-        more = [FurtherFailures(further.failures, values) for values in further.severities(any_vehicle)]
+        more = [analysis.FurtherFailures(further.failures, values) for values in further.severities(any_vehicle)]
     collided = np.isfinite(delta_v)
     if not collided.any():
         return None
@@ -231,12 +219,12 @@ def compute_severity(
     if thresholds is None:
         step = DELTA_V_STEP if largest > FINE_UP_TO else FINE_STEP
         thresholds = step * np.arange(math.ceil(largest / step) or 1)
-    expected = expect_over_failures(failures, injuries, estimate.confidence)
+    expected = analysis.expect_over_failures(failures, injuries, estimate.confidence)
     return Severity(
-        curve=compute_exceedance(estimate, failures, delta_v, thresholds, more[0]),
+        curve=analysis.compute_exceedance(estimate, failures, delta_v, thresholds, more[0]),
         largest_delta_v=largest,
         injuries=expected,
-        injuries_base=expect_under_refits(estimate, failures, injuries, expected, more[1]),
+        injuries_base=analysis.expect_under_refits(estimate, failures, injuries, expected, more[1]),
         n_replayed=int(failures.has_outcome.sum()),
         n_failures=failures.total,
         unknown=float(failures.weights[~failures.has_outcome].sum() / failures.weights.sum()),
@@ -303,7 +291,7 @@ def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crash
     sample, (rows, kinds, labels, listed) = require_sample(estimate), found
     x, weights = sample.x[rows], sample.weights[sample.f <= estimate.gamma][rows]
     modes = []
-    for label, share in sum_by_label(estimate, rows, labels).items():
+    for label, share in analysis.sum_by_label(estimate, rows, labels).items():
         mine, numbers = labels == label, np.flatnonzero(listed == label)
         mean = np.average(x[mine], axis=0, weights=weights[mine] if weights[mine].sum() > 0 else None)
         center = {column.name: float(mean[j]) for j, column in enumerate(list_columns(space)) if column.shown}
@@ -339,7 +327,7 @@ def _find_kinds(x: FloatArray, crashes: Crashes, failed: NDArray[np.bool_] | Non
     """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known, and where f failed."""
     kinds = np.array([crashes.get(digest, "") for digest in digest_scenarios(x)], dtype=object)
     if failed is not None:
-        kinds[failed] = NO_OUTCOME_LABEL
+        kinds[failed] = analysis.NO_OUTCOME_LABEL
     return kinds
 
 
@@ -348,7 +336,7 @@ def label_modes(u: FloatArray, kinds: Labels) -> Labels:
     labels = np.empty(len(kinds), dtype=object)
     for kind in dict.fromkeys(kinds.tolist()):
         mine = np.flatnonzero(kinds == kind)
-        clusters = cluster_points(u[mine]) if kind != NO_OUTCOME_LABEL else np.zeros(len(mine), dtype=np.int64)
+        clusters = cluster_points(u[mine]) if kind != analysis.NO_OUTCOME_LABEL else np.zeros(len(mine), dtype=np.int64)
         labels[mine] = [f"{kind}/{cluster}" for cluster in clusters]
     return labels
 
@@ -439,10 +427,10 @@ def _weigh_crashes(
         return {}, None
     replayed, further = replay_failures(problem, estimate)
     failures = replayed.failures
-    labels = np.full(len(failures.rows), NO_OUTCOME_LABEL, dtype=object)
+    labels = np.full(len(failures.rows), analysis.NO_OUTCOME_LABEL, dtype=object)
     by_scenario |= _label_scenarios(failures.x[failures.has_outcome], replayed.crash)
     labels[failures.has_outcome] = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
-    shares = sum_by_label(estimate, failures.rows, labels)
+    shares = analysis.sum_by_label(estimate, failures.rows, labels)
     return shares, compute_severity(problem, estimate, replayed, further)
 
 
@@ -463,7 +451,7 @@ def list_every_mode(space: ScenarioSpace, estimate: samplers.Estimate, crashes: 
     if found is None:
         return longer
     rows, _, labels, modes = found
-    return _list_more(longer, rows, labels, {*modes, f"{NO_OUTCOME_LABEL}/0", "/0"})
+    return _list_more(longer, rows, labels, {*modes, f"{analysis.NO_OUTCOME_LABEL}/0", "/0"})
 
 
 def _list_more(

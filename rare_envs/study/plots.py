@@ -17,16 +17,7 @@ from matplotlib.transforms import Affine2D
 from PIL import Image, ImageDraw
 
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.envs.rendering import (
-    AGENT,
-    CRASH_COLOUR,
-    FRAME_WIDTH,
-    OTHER_COLOURS,
-    ROLE_COLOURS,
-    Colour,
-    Renderer,
-    as_rgb,
-)
+from rare_envs.envs import rendering
 from rare_envs.exposure import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR, RateInterval, TotalRate
 from rare_envs.files import replace_file
 from rare_envs.plugins import EgoGone, reason_of
@@ -193,7 +184,7 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
 
 def vehicle_colour(name: str, number: int) -> str:
     """Return the colour of a vehicle by its name, or by its number if scenarios call no vehicle so."""
-    return ROLE_COLOURS.get(name, OTHER_COLOURS[number % len(OTHER_COLOURS)])
+    return rendering.ROLE_COLOURS.get(name, rendering.OTHER_COLOURS[number % len(rendering.OTHER_COLOURS)])
 
 
 def choose_moments(drive: Drive) -> list[int]:
@@ -220,7 +211,7 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
             VEHICLE_LENGTH,
             VEHICLE_WIDTH,
             facecolor=vehicle_colour(names[j], j),
-            edgecolor=CRASH_COLOUR if hit and j == 0 else "none",
+            edgecolor=rendering.CRASH_COLOUR if hit and j == 0 else "none",
         )
         body.set_transform(Affine2D().rotate(heading).translate(x - origin, y) + axes.transData)
         axes.add_patch(body)
@@ -332,19 +323,19 @@ CURVES_HEIGHT = 144
 """Height of the curves below the road of a film [pixels]."""
 LAST_FRAME_TICKS = 10
 """Ticks for which the last picture stays."""
-MARKER: Colour = (200, 0, 150)
+MARKER: rendering.Colour = (200, 0, 150)
 """Line at the present moment in the curves."""
 
 
 def draw_frames(drive: Drive) -> list[Image.Image]:
     """Return one picture for each moment, the road above the curves."""
-    renderer, shown = Renderer(drive.problem.world), []
+    renderer, shown = rendering.Renderer(drive.problem.world), []
     curves, columns, (top, bottom) = _draw_curves(drive)
     for k, episode in enumerate(drive.episodes):
         road = renderer.draw(episode, drive.time[k])
         below = curves.copy()
         ImageDraw.Draw(below).line([(columns[k], top), (columns[k], bottom)], fill=MARKER, width=2)
-        picture = Image.new("RGB", (FRAME_WIDTH, road.shape[0] + CURVES_HEIGHT))
+        picture = Image.new("RGB", (rendering.FRAME_WIDTH, road.shape[0] + CURVES_HEIGHT))
         picture.paste(Image.fromarray(road), (0, 0))
         picture.paste(below, (0, road.shape[0]))
         shown.append(picture)
@@ -354,7 +345,7 @@ def draw_frames(drive: Drive) -> list[Image.Image]:
 def _draw_curves(drive: Drive) -> tuple[Image.Image, list[int], tuple[int, int]]:
     """Return the measure over time as a picture; the column of each moment in it, and the ends of the axes [pixels]."""
     measure = drive.problem.world.measurement.measure
-    figure = Figure(figsize=(FRAME_WIDTH / 100, CURVES_HEIGHT / 100), dpi=100)
+    figure = Figure(figsize=(rendering.FRAME_WIDTH / 100, CURVES_HEIGHT / 100), dpi=100)
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.3, 0.9, 0.62))
     draw_measure(axes, drive)
@@ -378,7 +369,7 @@ def check_film_path(path: Path | str) -> None:
         raise BadInput(f"Expected a file that ends in .gif (the drive) or .png (its worst moment), got {str(path)!r}.")
 
 
-def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: int = 1) -> None:
+def write_film(path: Path | str, drive: Drive, width: int = rendering.FRAME_WIDTH, every: int = 1) -> None:
     """Write a drive as a moving picture (.gif), or its worst moment (.png).
 
     Args:
@@ -403,8 +394,9 @@ def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: 
     """
     check_film_path(path)
     path = Path(path)
-    shown = draw_frames(drive)
-    shown = [each.resize((width, round(each.height * width / FRAME_WIDTH)), Image.Resampling.LANCZOS) for each in shown]
+    frames = draw_frames(drive)
+    size = (width, round(frames[0].height * width / rendering.FRAME_WIDTH))
+    shown = [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames]
     with output_file(path), replace_file(path) as draft:
         if path.suffix.lower() == ".png":
             shown[drive.worst].save(draft)
@@ -415,7 +407,8 @@ def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: 
 
 def _make_gif_palette() -> Image.Image:
     """Return a picture with the colours of a GIF: greys, and those of vehicles as they are, in shade and in light."""
-    colours = [*(as_rgb(each) for each in (*ROLE_COLOURS.values(), *OTHER_COLOURS, CRASH_COLOUR)), MARKER, AGENT]
+    named = (*rendering.ROLE_COLOURS.values(), *rendering.OTHER_COLOURS, rendering.CRASH_COLOUR)
+    colours = [*map(rendering.as_rgb, named), MARKER, rendering.AGENT]
     mixed = [
         tuple(round((1 - share) * own + share * other) for own, other in zip(colour, beside, strict=True))
         for colour in colours

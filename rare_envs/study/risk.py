@@ -12,15 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from rare_envs import exposure
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.exposure import (
-    HUMAN_BENCHMARKS,
-    MILLION_KM,
-    CollisionRate,
-    TotalRate,
-    describe_human_contacts,
-    read_site,
-)
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
@@ -52,7 +45,7 @@ def list_sites(scenario: Scenario) -> dict[str, str]:
     found: dict[str, str] = {}
     for name in scenario.bases:
         base = _load_fitted(scenario, name)
-        site = "" if base is None else read_site(base.record)
+        site = "" if base is None else exposure.read_site(base.record)
         if site and site not in found.values():
             found[name] = site
     return found
@@ -81,7 +74,7 @@ def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) 
     scenario, own = study.problem.world.scenario, study.fitted
     for name, site in list_sites(scenario).items():
         base = _load_fitted(scenario, name)
-        if base is None or base.frequency is None or (own is not None and site == read_site(own.record)):
+        if base is None or base.frequency is None or (own is not None and site == exposure.read_site(own.record)):
             continue
         other = study.under(name)
         try:
@@ -89,7 +82,7 @@ def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) 
         except ValueError:
             p = run(other, progress).estimate.p if name in sites else math.nan
         if p > 0:
-            factors[name] = p * base.frequency.per_km / report.rate.per_million_km * MILLION_KM
+            factors[name] = p * base.frequency.per_km / report.rate.per_million_km * exposure.MILLION_KM
     return factors
 
 
@@ -99,7 +92,7 @@ class ScenarioRisk:
 
     report: Report
     """Its evaluation."""
-    rate: CollisionRate
+    rate: exposure.CollisionRate
     """Its collisions per hour and per km."""
     site_factors: Mapping[str, float]
     """Rates under the bases of other sites over that under its own, by name, as far as they are known."""
@@ -113,7 +106,7 @@ class ScenarioRisk:
     @property
     def kinds(self) -> dict[str, float]:
         """Collisions per million km by kind of crash; empty where it is not known."""
-        scale = self.rate.frequency.per_km * MILLION_KM
+        scale = self.rate.frequency.per_km * exposure.MILLION_KM
         return {kind: scale * share.p for kind, share in self.report.kinds.shares.items()}
 
     def describe(self) -> str:
@@ -152,16 +145,16 @@ class Risk:
     scenarios: tuple[ScenarioRisk, ...]
 
     @cached_property
-    def total(self) -> TotalRate:
+    def total(self) -> exposure.TotalRate:
         """Sum over the scenarios."""
-        return TotalRate(tuple(each.rate for each in self.scenarios))
+        return exposure.TotalRate(tuple(each.rate for each in self.scenarios))
 
     @cached_property
-    def injuries(self) -> TotalRate | None:
+    def injuries(self) -> exposure.TotalRate | None:
         """Serious injuries (MAIS 3 or more), summed over the scenarios with collisions; None where there are none."""
         found = [(each.report.injury_rate, each.rate.site_log_sd) for each in self.scenarios]
         rates = tuple(replace(rate, site_log_sd=spread) for rate, spread in found if rate is not None)
-        return TotalRate(rates) if rates else None
+        return exposure.TotalRate(rates) if rates else None
 
     @property
     def kinds(self) -> dict[str, float]:
@@ -195,7 +188,7 @@ class Risk:
         per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
         per_hour = text.format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
         lines = [
-            f"collisions per million km  {per_km}   {describe_human_contacts()}",
+            f"collisions per million km  {per_km}   {exposure.describe_human_contacts()}",
             *(f"  {each.describe()}" for each in self.scenarios),
             f"  per hour      {per_hour}",
         ]
@@ -218,7 +211,7 @@ class Risk:
             "kinds_per_million_km": self.kinds,
             "injuries": None if self.injuries is None else self.injuries.to_dict(),
             "further_events": None if needed is None else needed._asdict(),
-            "people": [benchmark.to_dict() for benchmark in HUMAN_BENCHMARKS],
+            "people": [benchmark.to_dict() for benchmark in exposure.HUMAN_BENCHMARKS],
             "doubtful": bool(self.warnings),
             "warnings": list(self.warnings),
             "notes": list(self.notes),

@@ -11,15 +11,8 @@ import numpy as np
 from rich.console import Console
 
 import samplers
+from rare_envs import exposure
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.exposure import (
-    CollisionRate,
-    RateInterval,
-    TotalRate,
-    VarianceShare,
-    describe_human_contacts,
-    summarise_human_contacts,
-)
 from rare_envs.measures import MEASURES
 from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.failures import KIND_DESCRIPTIONS
@@ -60,7 +53,7 @@ def format_rate(value: float) -> str:
     return format_alike(value)[0]
 
 
-def format_with_interval(value: float, interval: RateInterval, unit: str = "", level: str = "") -> str:
+def format_with_interval(value: float, interval: exposure.RateInterval, unit: str = "", level: str = "") -> str:
     """Return a rate with its interval, or what it is below, all numbers in one form."""
     middle, low, high = format_alike(value, *interval)
     return f"{middle}{unit} ({level}{f'{low} to' if interval[0] > 0 else 'below'} {high})"
@@ -76,14 +69,14 @@ def name_scenario(name: str) -> str:
     return "cut-in" if name == "cut_in" else name.replace("_", " ")
 
 
-def describe_injuries(rate: CollisionRate | TotalRate) -> str:
+def describe_injuries(rate: exposure.CollisionRate | exposure.TotalRate) -> str:
     """Return a rate of serious injuries with its interval, in words."""
     return "serious injuries (MAIS 3+) " + format_with_interval(
         rate.per_million_km, rate.interval_per_million_km, " per million km", f"{100 * rate.confidence:g} %: "
     )
 
 
-def describe_uncertainty(total: TotalRate, recorded: dict[str, int]) -> str:
+def describe_uncertainty(total: exposure.TotalRate, recorded: dict[str, int]) -> str:
     """Return what the uncertainty of a total comes from; empty if it is not known."""
     parts = []
     if total.shares:
@@ -105,7 +98,7 @@ def describe_uncertainty(total: TotalRate, recorded: dict[str, int]) -> str:
     return "; ".join(parts)
 
 
-def name_source(each: VarianceShare) -> str:
+def name_source(each: exposure.VarianceShare) -> str:
     """Return a source of uncertainty in words, such as "the cut-in distribution"."""
     scenario = name_scenario(each.scenario)
     nouns = {"base": f"the {scenario} distribution", "site": f"{scenario} at other sites", **SOURCE_NOUNS}
@@ -180,20 +173,7 @@ Row = tuple[str, str]
 
 
 def print_report(report: Report, out: Path | None = None, details: bool = False) -> None:
-    """Print the number, what it rests on, the most likely failure, and where the files are.
-
-    Args:
-        report: What to print.
-        out: Folder of the run.
-        details: Print everything: rates, kinds and severity with intervals, all parameters of the most likely failure.
-
-    Example:
-        >>> from rare_envs.study import Question, prepare, run
-        >>> report = run(prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=100, horizon=1.0)))
-        >>> print_report(report)  # doctest: +ELLIPSIS
-        P[f <= 0] = 0.000e+00   rare_envs/CarFollowing-v0, ego idm
-          95 % interval   0.000e+00 to ...
-    """
+    """Print the number, what it rests on, the most likely failure, and where the files are; with details everything."""
     # markup off: P[f <= 0] and what warnings quote would be read as tags
     console = Console(highlight=False, soft_wrap=True, markup=False)
     estimate, question = report.estimate, report.study.question
@@ -255,13 +235,13 @@ def _list_rates(report: Report, details: bool) -> Iterator[Row]:
     per_km = format_with_interval(rate.per_million_km, rate.interval_per_million_km, unit)
     if details:
         per_hour = format_with_interval(rate.per_hour, rate.interval_per_hour, " per hour")
-        yield "collisions", f"{per_km}, {per_hour}; {describe_human_contacts()}"
+        yield "collisions", f"{per_km}, {per_hour}; {exposure.describe_human_contacts()}"
         shares = sorted(rate.shares.items(), key=lambda part: -part[1])
         parts = ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in shares if share > 0)
         events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
         yield "", f"from {events}{f'; the uncertainty is {parts}' if parts else ''}"
     else:
-        yield "collisions", f"{per_km}; {summarise_human_contacts()}"
+        yield "collisions", f"{per_km}; {exposure.summarise_human_contacts()}"
     if injuries is not None and details:
         yield "", describe_injuries(injuries)
     elif injuries is not None:

@@ -23,26 +23,12 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import digest_file, format_json, replace_file, replace_text
 from rare_envs.startup import __version__
+from rare_envs.study import run_folder
 from rare_envs.study.arguments import BadInput, Question, UnwrittenResults, read_question
 from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import save_plot, saved_figure
 from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question, note_question, read_about
 from rare_envs.study.report import Report
-from rare_envs.study.run_folder import (
-    CRASH,
-    DIGESTED,
-    FAILURES,
-    FAULT_BLOCKS,
-    FAULTS,
-    JOURNAL,
-    PLOT,
-    RESULT,
-    RESULT_FILES,
-    SENSITIVITY,
-    SEVERITY,
-    STUDY,
-    STUDY_FORMAT,
-)
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
@@ -53,11 +39,11 @@ BEGIN_AGAIN = "give the command again."
 
 def begin_journal(folder: Path, question: Question, force: bool = False) -> Journal:
     """Return the journal of a new run; with `force` it replaces that of an unfinished one."""
-    if not force and not (folder / JOURNAL).exists():
+    if not force and not (folder / run_folder.JOURNAL).exists():
         check_no_results(folder)
     head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
     try:
-        return Journal.create(folder / JOURNAL, head, replace=force)
+        return Journal.create(folder / run_folder.JOURNAL, head, replace=force)
     except JournalError as error:
         if "already" not in str(error):
             raise BadInput(error) from error
@@ -71,13 +57,13 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
     """Return the journal of an unfinished run, and its question; of a damaged one `mend` keeps what is before that."""
-    path, begun = folder / JOURNAL, "stopped before its first simulations"
+    path, begun = folder / run_folder.JOURNAL, "stopped before its first simulations"
     try:
         journal = Journal.open(path, mend)
     except FileNotFoundError as error:
-        why = f"it has no {JOURNAL}. Of one that was {begun}, {BEGIN_AGAIN}"
-        if (folder / RESULT).is_file():
-            why = f"it has a finished one ({RESULT})."
+        why = f"it has no {run_folder.JOURNAL}. Of one that was {begun}, {BEGIN_AGAIN}"
+        if (folder / run_folder.RESULT).is_file():
+            why = f"it has a finished one ({run_folder.RESULT})."
         elif not folder.is_dir():
             why = f"the folder does not exist. Of a run that was {begun}, {BEGIN_AGAIN}"
         raise BadInput(f"There is no unfinished run in {str(folder)!r}: {why}") from error
@@ -105,14 +91,14 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
 
 def check_no_results(folder: Path, *names: str) -> None:
     """Raise a BadInput if a folder has results of a finished run, or files of these names."""
-    for name in (RESULT, FAILURES, *names):
+    for name in (run_folder.RESULT, run_folder.FAILURES, *names):
         if (folder / name).exists():
             raise BadInput(f"There is a finished run in {str(folder)!r} ({name}): replace it by --force.")
 
 
 def _remove_drafts(folder: Path) -> None:
     """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
-    for name in map(Path, RESULT_FILES):
+    for name in map(Path, run_folder.RESULT_FILES):
         for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
             draft.unlink(missing_ok=True)
 
@@ -135,20 +121,20 @@ def write_run(folder: Path, report: Report) -> None:
         'no_hits'
     """
     space, faults, kinds = report.study.problem.space, report.faults, report.kinds
-    replace_text(folder / RESULT, format_json(report.to_dict()) + "\n")
-    nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in CRASH[1:]))
+    replace_text(folder / run_folder.RESULT, format_json(report.to_dict()) + "\n")
+    nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in run_folder.CRASH[1:]))
     write_failures(folder, space, report.estimate.failures, [_list_crash(each) or nobody for each in report.crashes])
-    for name in (FAULTS, FAULT_BLOCKS, SENSITIVITY, SEVERITY):
+    for name in (run_folder.FAULTS, run_folder.FAULT_BLOCKS, run_folder.SENSITIVITY, run_folder.SEVERITY):
         (folder / name).unlink(missing_ok=True)
     if faults:
         x = np.stack([fault.x for fault in faults])
-        _write_table(folder / FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
-    save_plot(folder / PLOT, report)
+        _write_table(folder / run_folder.FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
+    save_plot(folder / run_folder.PLOT, report)
     if isinstance(report.sensitivity, samplers.Sensitivity):
-        with saved_figure(folder / SENSITIVITY, 14, 4.5) as figure:
+        with saved_figure(folder / run_folder.SENSITIVITY, 14, 4.5) as figure:
             report.sensitivity.plot(list(figure.subplots(1, 2)))
     if kinds.severity is not None:
-        with saved_figure(folder / SEVERITY, 7, 4.5) as figure:
+        with saved_figure(folder / run_folder.SEVERITY, 7, 4.5) as figure:
             kinds.severity.plot(figure.subplots())
 
 
@@ -165,7 +151,8 @@ def write_failures(
 ) -> None:
     """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and the columns `CRASH` if known."""
     rows = [(one.f, one.log_p0, *crash) for one, crash in zip(failures, crashes or [()] * len(failures), strict=True)]
-    _write_table(folder / FAILURES, space, failures.x, ("f", "log_p0", *(CRASH if crashes else ())), rows)
+    names = ("f", "log_p0", *(run_folder.CRASH if crashes else ()))
+    _write_table(folder / run_folder.FAILURES, space, failures.x, names, rows)
 
 
 def _write_table(
@@ -199,7 +186,7 @@ LIBRARIES = "cvxpy gymnasium highway-env numba numpy onnxruntime scikit-learn sc
 
 def begin_study_file(folder: Path, study: Study) -> None:
     """Write study.json of a run that begins, in place of the files of an earlier one, and note that it was asked."""
-    for name in RESULT_FILES:
+    for name in run_folder.RESULT_FILES:
         (folder / name).unlink(missing_ok=True)
     _remove_drafts(folder)
     _write_study_file(folder, describe_study(study))
@@ -222,7 +209,7 @@ def finish_run(folder: Path, report: Report) -> None:
         begun = read_about(folder)  # stays, but for one of another question, which somebody has put there
         if not begun or ("question" in begun and not is_same_question(begun["question"], report.study.question)):
             begun = describe_study(report.study)
-        digests = {name: digest_file(folder / name) for name in DIGESTED if (folder / name).is_file()}
+        digests = {name: digest_file(folder / name) for name in run_folder.DIGESTED if (folder / name).is_file()}
         ended = {"finished": _now(), "seconds": report.seconds, "results": digests}
         _write_study_file(folder, {**begun, **ended})
     except OSError as error:
@@ -245,7 +232,7 @@ def describe_study(study: Study) -> dict[str, Any]:
     ours = program.stem == "rare-envs" or program.parts[-2:] == ("rare_envs", "__main__.py")
     columns = zip(space.names, space.units, space.sizes, strict=True)
     return {
-        "format": STUDY_FORMAT,
+        "format": run_folder.STUDY_FORMAT,
         "command": shlex.join(["rare-envs", *sys.argv[1:]]) if ours else "",
         "begun": _now(),
         "finished": None,
@@ -269,7 +256,7 @@ def describe_study(study: Study) -> dict[str, Any]:
 
 
 def _write_study_file(folder: Path, about: dict[str, Any]) -> None:
-    replace_text(folder / STUDY, format_json(about) + "\n")
+    replace_text(folder / run_folder.STUDY, format_json(about) + "\n")
 
 
 def _now() -> str:
