@@ -29,7 +29,7 @@ from agents.learned.networks import (
     apply_heads,
     is_plain,
 )
-from agents.learned.rules import STATE_SIZE, ChangeAction, ChangeState, CollisionAvoidance, LaneChanges, Seen
+from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges, Seen
 from rare_envs.control import actions
 from rare_envs.control.idm import IDM
 from rare_envs.devices import constant
@@ -152,8 +152,8 @@ class LearnedDriver:
         if self.changes is None or memory is None or swings is None:
             return self.avoidance.limit(seen, action), swings
         state = ChangeState.unpack(memory[..., _NOISE_SIZE:])
-        change, state = self.changes.step(seen, state, innovations)
-        action = self.avoidance.limit(seen, self._change_lanes(self.avoidance, seen, change, action))
+        action, state = self.changes.step(seen, state, innovations, action, self.avoidance)
+        action = self.avoidance.limit(seen, torch.stack((action[..., 0], action[..., 1].clamp(*self.yaw_rate)), dim=-1))
         return action, torch.cat((swings.flatten(-2), state.pack().to(swings.dtype)), dim=-1)
 
     def _check_shapes(
@@ -181,15 +181,6 @@ class LearnedDriver:
         acceleration, yaw_rate = action.unbind(dim=-1)
         eased = torch.maximum(acceleration, self.hard_braking * (acceleration + EASED_BEYOND) - EASED_BEYOND)
         return torch.stack((eased, yaw_rate), dim=-1)
-
-    def _change_lanes(self, rule: CollisionAvoidance, seen: Seen, change: ChangeAction, action: Tensor) -> Tensor:
-        """Return actions (B, M, 2) with the course of a lane change for the steering of those who are in one."""
-        bound = rule.bound_acceleration_behind(change.gap, change.closing, seen.speed)
-        acceleration = torch.where(change.follows, torch.minimum(action[..., 0], bound), action[..., 0])
-        left, right = rule.bound_yaw_rates_within(seen, change.room)
-        inside = torch.minimum(torch.maximum(action[..., 1], -left), right)
-        yaw_rate = torch.where(change.changing, change.yaw_rate, inside).clamp(*self.yaw_rate)
-        return torch.stack((acceleration, yaw_rate), dim=-1)
 
     @property
     def recordable(self) -> bool:

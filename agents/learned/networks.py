@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.sparse import coo_array
 from torch import Tensor, nn
 
 from rare_envs.devices import constant
@@ -284,10 +285,8 @@ class WeightDistribution:
         """Return the distribution of which `to_arrays` gave the arrays."""
         mean, values = arrays["mean"].astype(np.float64), arrays["precision"].astype(np.float64)
         rows, columns = arrays["rows"].astype(np.int64), arrays["columns"].astype(np.int64)
-        if not (mean.ndim == rows.ndim == 1 and rows.shape == columns.shape == values.shape):
-            raise ValueError(f"Expected triplets of one length, got {rows.shape}, {columns.shape}, {values.shape}.")
-        if ((rows < 0) | (rows > columns) | (columns >= len(mean))).any():
+        if (rows > columns).any():
             raise ValueError(f"Expected triplets of the upper triangle of a {len(mean)} x {len(mean)} matrix.")
-        precision = np.zeros((len(mean), len(mean)))
-        precision[rows, columns] = precision[columns, rows] = values
+        upper = coo_array((values, (rows, columns)), (len(mean), len(mean))).toarray()
+        precision = upper + np.triu(upper, 1).T
         return cls(mean, precision, radius)

@@ -268,23 +268,6 @@ class ChangeState(NamedTuple):
         return seen.lane * (1.0 - self.crossed) - self.side * seen.offset
 
 
-class ChangeAction(NamedTuple):
-    """How to act in a change, shape (B, M) each."""
-
-    changing: Tensor
-    """True where a change is under way."""
-    yaw_rate: Tensor
-    """[rad/s]; means something only there."""
-    follows: Tensor
-    """True where it has to keep off somebody ahead in the new lane too."""
-    gap: Tensor
-    """To that one [m]; means something only there."""
-    closing: Tensor
-    """Speed at which it closes [m/s]."""
-    room: Tensor
-    """How far across it may go to the left and to the right [m], negative if it has to come back; shape (B, M, 2)."""
-
-
 @dataclass(frozen=True)
 class LaneChanges:
     """Lane changes at a hazard rate, on a cubic course.
@@ -348,8 +331,10 @@ class LaneChanges:
         never = torch.full_like(draws, torch.inf)
         return ChangeState(patience_of(draws), never, none, none + _UNSTARTED, none, none, none, none)
 
-    def step(self, seen: Seen, state: ChangeState, innovations: Tensor | None) -> tuple[ChangeAction, ChangeState]:
-        """Return how to act for one tick, and the new state; with standard normal draws (B, M, 2), None for 0."""
+    def step(
+        self, seen: Seen, state: ChangeState, innovations: Tensor | None, action: Tensor, rule: CollisionAvoidance
+    ) -> tuple[Tensor, ChangeState]:
+        """Return an action (B, M, 2) as a change has it, and the new state; from draws (B, M, 2), None for 0."""
         lanes = AdjacentLanes.read(seen)
         state = self._remember(seen, lanes, state)
         state = self._take_up(seen, lanes, state)
@@ -359,7 +344,7 @@ class LaneChanges:
         over = ((state.share >= 1.0) & settled) | (_of_side(seen.lines, state.side) < 0.0)
         state = state._replace(side=torch.where(over, 0.0, state.side))
         slowness = (seen.speed / self.slow).clamp(0.0, 1.0)
-        action = self._follow_course(seen, lanes, state, left, slowness)
+        action = self._follow_course(seen, lanes, state, left, slowness, action, rule)
         return action, state._replace(share=state.share + LEARNED_TICK * (state.pace * slowness))
 
     def _remember(self, seen: Seen, lanes: AdjacentLanes, state: ChangeState) -> ChangeState:
@@ -430,9 +415,19 @@ class LaneChanges:
         return torch.exp((covariates * constant(self.coefficients, covariates)).sum(dim=-1))
 
     def _follow_course(
-        self, seen: Seen, lanes: AdjacentLanes, state: ChangeState, left: Tensor, slowness: Tensor
-    ) -> ChangeAction:
-        """Return how to act with some distance left [m], where time passes slower by a factor, (B, M) each."""
+        self,
+        seen: Seen,
+        lanes: AdjacentLanes,
+        state: ChangeState,
+        left: Tensor,
+        slowness: Tensor,
+        action: Tensor,
+        rule: CollisionAvoidance,
+    ) -> Tensor:
+        """Return an action (B, M, 2) on the course where a change is under way, else within the known lanes.
+
+        There is some distance left [m], and time passes slower by a factor, (B, M) each.
+        """
         share, pace, frequency = state.share.clamp(0.0, 1.0), state.pace * slowness, self.frequency * slowness
         wanted = state.distance * (1.0 - share.square() * (3.0 - 2.0 * share))
         across = 6.0 * state.distance * share * (1.0 - share) * pace
@@ -440,16 +435,17 @@ class LaneChanges:
         is_across = state.side * seen.speed * torch.sin(seen.heading)
         gain = gain + 2.0 * frequency * (across - is_across) + frequency.square() * (left - wanted)
         changing, gap = state.side != 0.0, _of_side(lanes.lead_gap, state.side)
+        # whoever is ahead in the new lane is kept off too
         follows = changing & (state.crossed == 0.0) & (gap < torch.inf) & (gap > 0.0)
+        ahead, closing = torch.where(follows, gap, MAX_RANGE), _of_side(lanes.lead_closing, state.side)
+        bound = rule.bound_acceleration_behind(ahead, closing, seen.speed)
+        acceleration = torch.where(follows, torch.minimum(action[..., 0], bound), action[..., 0])
         free = (state.unseen < self.remembered) | changing[..., None]
-        return ChangeAction(
-            changing,
-            state.side * gain / seen.speed.clamp(min=_LEAST_SPEED),
-            follows,
-            torch.where(follows, gap, MAX_RANGE),
-            _of_side(lanes.lead_closing, state.side),
-            torch.where(free, MAX_RANGE, seen.lines - self.margin),
-        )
+        room = torch.where(free, MAX_RANGE, seen.lines - self.margin)
+        leftmost, rightmost = rule.bound_yaw_rates_within(seen, room)
+        inside = torch.minimum(torch.maximum(action[..., 1], -leftmost), rightmost)
+        course = state.side * gain / seen.speed.clamp(min=_LEAST_SPEED)
+        return torch.stack((acceleration, torch.where(changing, course, inside)), dim=-1)
 
 
 def patience_of(draws: Tensor) -> Tensor:

@@ -151,9 +151,10 @@ def test_what_is_no_law_is_refused(small):
         with pytest.raises(ValueError, match=message):
             WeightDistribution(*given)
     arrays = small.to_arrays()
-    with pytest.raises(ValueError, match="upper triangle"):
-        WeightDistribution.from_arrays({**arrays, "columns": arrays["columns"] + 1})
-    with pytest.raises(ValueError, match="one length"):
+    for wrong in ({"columns": arrays["columns"] + 1}, {"rows": arrays["columns"] + 1}, {"rows": arrays["rows"] - 1}):
+        with pytest.raises(ValueError, match=r"upper triangle|exceeds|negative"):
+            WeightDistribution.from_arrays({**arrays, **wrong})
+    with pytest.raises(ValueError, match="same length"):
         WeightDistribution.from_arrays({**arrays, "precision": arrays["precision"][1:]})
 
 

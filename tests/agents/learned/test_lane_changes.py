@@ -46,19 +46,23 @@ def begin(left=9.0, right=9.0, changes=CHANGES):
     return state._replace(patience=torch.tensor([[[left, right]]], dtype=torch.float64))
 
 
-def step(features, state, draws=None, changes=CHANGES):
-    """Return how to act for a tick, and the state after it."""
-    return changes.step(Seen.read(features), state, draws)
+def step(features, state, draws=None, changes=CHANGES, action=(9.0, 9.0)):
+    """Return acceleration and yaw rate for a tick, and the state after it, where others are wanted."""
+    wanted = torch.tensor([[action]], dtype=torch.float64)
+    action, state = changes.step(Seen.read(features), state, draws, wanted, CollisionAvoidance())
+    return action[0, 0].tolist(), state
 
 
 def drive(state, seconds, changes=CHANGES, speed=20.0, y=0.0, heading=0.0, beams=OTHERS):
     """Yield time, y from the middle of the first lane, heading and state of a car that steers by changes alone."""
     for tick in range(round(seconds / 0.1)):
         lane = round(y / WIDTH)
-        action, state = step(on_lane(y - lane * WIDTH, heading, speed, **beams), state, changes=changes)
+        (_, yaw_rate), state = step(
+            on_lane(y - lane * WIDTH, heading, speed, **beams), state, None, changes, (0.0, 0.0)
+        )
         yield 0.1 * tick, y, heading, state
         y += speed * math.sin(heading) * 0.1
-        heading += 0.1 * float(action.yaw_rate) * bool(action.changing)
+        heading += 0.1 * yaw_rate * bool(state.side != 0)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -111,12 +115,12 @@ def test_no_change_begins_and_no_patience_is_used_where_there_is_no_room():
 
 def test_whoever_is_ahead_in_the_new_lane_is_kept_off_until_the_line():
     ahead = {"range_18": 13.0, "rate_18": -1.0} | {"range_m36": 11.0}
-    action, state = step(on_lane(**ahead), begin(right=0.0), None)
-    assert bool(action.follows)
-    assert float(action.gap) == pytest.approx(13.0 * math.cos(math.radians(18)) - 2.5)
-    assert float(action.closing) == pytest.approx(1.0 / math.cos(math.radians(18)))
-    action, _ = step(on_lane(-1.7, **ahead), state._replace(offset=state.offset + 1.7), None)
-    assert not bool(action.follows)
+    (acceleration, _), state = step(on_lane(**ahead), begin(right=0.0))
+    gap, closing = 13.0 * math.cos(math.radians(18)) - 2.5, 1.0 / math.cos(math.radians(18))
+    numbers = (torch.tensor(value, dtype=torch.float64) for value in (gap, closing, 20.0))
+    assert acceleration == pytest.approx(CollisionAvoidance().bound_acceleration_behind(*numbers).item())
+    (acceleration, _), _ = step(on_lane(-1.7, **ahead), state._replace(offset=state.offset + 1.7))
+    assert acceleration == 9.0
 
 
 def test_a_change_under_way_at_the_first_moment_is_taken_up():
@@ -127,8 +131,8 @@ def test_a_change_under_way_at_the_first_moment_is_taken_up():
         _, state = step(on_lane(1.1, 0.36 / 20.0), begin(), changes=replace(CHANGES, over_line=over_line))
         assert int(state.side) == side
     late = list(drive(begin(), 0.3, y=0.0, heading=0.0))[-1][3]
-    moving, _ = step(on_lane(0.8, 0.8 / 20.0, **OTHERS), late, None)
-    assert not bool(moving.changing)  # at the first moment only: later it may be the noise
+    _, moving = step(on_lane(0.8, 0.8 / 20.0, **OTHERS), late)
+    assert int(moving.side) == 0  # at the first moment only: later it may be the noise
 
 
 # --- the driver ----------------------------------------------------------------------------------
