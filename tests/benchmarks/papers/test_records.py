@@ -93,48 +93,29 @@ def test_it_goes_on_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert "choose another --out" in capsys.readouterr().err
 
 
-def write_runs(folder: Path, study: dict, name: str = "runs.jsonl") -> Path:
-    file = folder / name
-    file.write_text(json.dumps({"study": study}) + '\n{"p": 1e-3}\n')
-    return file
-
-
 @pytest.mark.parametrize(
     ("held", "new", "said"),
     [
         (TIAN_RUNS, HIGHWAY_RUNS, "holds tian2024, replications 5, seed 0; this is okelly2018, ego lidar, scale small"),
-        (
-            HIGHWAY_RUNS,
-            TIAN_RUNS,
-            "holds okelly2018, ego lidar, scale small, seed 2018; this is tian2024,",
-        ),
+        (HIGHWAY_RUNS, TIAN_RUNS, "holds okelly2018, ego lidar, scale small, seed 2018; this is tian2024,"),
         (TIAN_RUNS, TianPlan(5, seed=1).identity, "this is tian2024, replications 5, seed 1: choose another --out"),
         (HIGHWAY_RUNS, HighwayStudy("vision").identity, "this is okelly2018, ego vision,"),
         (HIGHWAY_RUNS, HighwayStudy(scale="full").identity, "scale full"),
+        (None, TIAN_RUNS, "holds runs of another command or version; this is tian2024"),
     ],
 )
 def test_another_paper_seed_scale_or_ego_is_refused(tmp_path: Path, held: dict, new: dict, said: str) -> None:
-    write_runs(tmp_path, held)
-    check_folder(tmp_path, held)
-    with pytest.raises(BadInput, match=said) as caught:
-        check_folder(tmp_path, new)
-    assert str(tmp_path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("line", ['{"rare_envs": "0.1.0"}\n', "[1]\n", "no JSON\n", "{}\n"])
-def test_files_of_other_commands_are_refused(tmp_path: Path, line: str) -> None:
-    (tmp_path / "own.jsonl").write_text(line)
-    with pytest.raises(BadInput, match="holds runs of another command or version; this is tian2024"):
-        check_folder(tmp_path, TIAN_RUNS)
-
-
-def test_folders_without_runs_are_taken(tmp_path: Path) -> None:
-    """None, an empty one, and one whose first line a stop has cut off."""
-    check_folder(tmp_path / "none", TIAN_RUNS)
-    check_folder(tmp_path, TIAN_RUNS)
-    (tmp_path / "runs.jsonl").write_text('{"study": {"paper": "okel')
-    check_folder(tmp_path, TIAN_RUNS)
+    """So is a file of another command; none, an empty folder and a torn first line are taken."""
+    check_folder(tmp_path / "none", new)
+    check_folder(tmp_path, new)
+    file = tmp_path / "runs.jsonl"
+    file.write_text('{"study": {"paper": "okel')
+    check_folder(tmp_path, new)
+    for line in [json.dumps({"study": held})] if held else ['{"rare_envs": "0.1.0"}', "[1]", "no JSON", "{}"]:
+        file.write_text(line + '\n{"p": 1e-3}\n')
+        with pytest.raises(BadInput, match=said) as caught:
+            check_folder(tmp_path, new)
+        assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def record_by_hand() -> dict[str, Any]:

@@ -14,7 +14,6 @@ from rare_envs.scenarios.registry import scenario_named
 from training.fit import mixture as mixture_fit
 from training.fit.base import (
     CHECK_DRAWS,
-    DANGEROUS_STATES,
     check_predictions,
     fit_base,
     format_base,
@@ -94,13 +93,6 @@ def test_the_coordinate_of_the_duration_is_chosen_by_the_changes(quick, logarith
     assert min(selection, key=lambda each: each["bic"])["coordinates"] == word
     assert base.events.used == (40, 200)
     assert {refit.coordinates.kinds[6] for refit in base.refits} == {"log" if logarithmic else "plain"}
-
-
-def test_states_by_hand():
-    """10 m/s faster: a TTC of 5 s at 50 m, where 100 / 100 m/s^2 are needed too."""
-    for state in ("TTC < 5 s", "needed deceleration > 1 m/s^2"):
-        found = DANGEROUS_STATES[state](np.full(2, 20.0), np.full(2, 10.0), np.array([49.0, 51.0]))
-        assert found.tolist() == [True, False], state
 
 
 def test_expected_counts_are_shares_times_events():

@@ -22,7 +22,6 @@ from training.fit.coordinates import (
 )
 from training.fit.filters import EventSet
 from training.fit.mixture import (
-    COVARIANCE_FLOOR,
     EM_ITERATIONS,
     SMALLEST_COMPONENT,
     TOLERANCE,
@@ -30,34 +29,11 @@ from training.fit.mixture import (
     select_mixture,
 )
 
-TRUTH = TruncatedGaussianMixture(
-    [0.65, 0.35],
-    [[10.0, 5.0], [20.0, 12.0]],
-    [[[4.0, 1.5], [1.5, 2.0]], [[2.0, -0.6], [-0.6, 1.0]]],
-    [-20.0, -20.0],
-    [50.0, 50.0],
-)
-
 
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer starts: enough for well separated clusters."""
     monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
-
-
-def test_fit_recovers_a_known_mixture(quick):
-    n = 2000
-    mixture, _ = select_mixture(TRUTH.sample(n, np.random.default_rng(1)), 0)
-    assert len(mixture.weights) == 2
-    assert abs(mixture.weights[0] - 0.65) < 4.0 * np.sqrt(0.65 * 0.35 / n)
-    counts = n * TRUTH.weights
-    for k in range(2):
-        variance = np.diag(TRUTH.covariances[k])
-        assert (np.abs(mixture.means[k] - TRUTH.means[k]) < 4.0 * np.sqrt(variance / counts[k])).all()
-        # Sampling error of a covariance, and the floor: 1 % of the overall variance.
-        error = 4.0 * np.sqrt(2.0 / counts[k]) * np.sqrt(np.outer(variance, variance))
-        floor = COVARIANCE_FLOOR * np.diag([30.0, 15.0])
-        assert (np.abs(mixture.covariances[k] - TRUTH.covariances[k]) < error + floor).all()
 
 
 def test_a_component_on_a_handful_of_events_is_rejected(quick):
@@ -192,16 +168,6 @@ def events(n, seed=0, per_cluster=1):
     rng = np.random.default_rng(seed)
     x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])
     return EventSet(x, np.arange(n) // per_cluster)
-
-
-@pytest.mark.slow
-def test_the_spread_is_the_standard_error_of_the_mean(quick):
-    """Of n independent events: sd / sqrt(n), here from 40 refits, so to 11 % (two standard errors 23 %)."""
-    n = 200
-    recorded = events(n)
-    fits = [each.distribution for each in refit(recorded, [LOG_GAP], FOLLOWING, n=40)]
-    means = np.array([fit.weights @ fit.means[:, 0] for fit in fits])
-    assert means.std(ddof=1) == pytest.approx(recorded.joint[:, 0].std() / np.sqrt(n), rel=0.3)
 
 
 def test_more_refits_where_the_number_of_components_differs(monkeypatch):
