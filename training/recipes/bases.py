@@ -151,7 +151,7 @@ def _read_i24_leaders(folder: Path) -> Read:
         drives.append(np.full(len(parts[-1]), drive, dtype=np.int64))
     events, clusters = np.concatenate(parts), np.concatenate(drives)
     box, keep = scenario_named(FOLLOWING).parameters, np.ones(len(events), dtype=bool)
-    inside = ((events >= [p.low for p in box]) & (events <= [p.high for p in box])).all(axis=1)
+    inside = np.asarray(((events >= [p.low for p in box]) & (events <= [p.high for p in box])).all(axis=1))
     rule = ("within the ranges of the scenario", "outside the physical range", inside)
     log = ({"rule": "events read", "events": len(events)}, *drop_events(keep, [rule]))
     return EventSet(events[keep], clusters[keep], cluster="drive", log=log), {}

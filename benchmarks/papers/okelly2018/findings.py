@@ -167,7 +167,7 @@ def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -
         (
             PaperClaim("vehicles box in the ego", above=True),
             f"share of starts with a vehicle within {BESIDE:g} m in both lanes beside",
-            lambda columns: (distances_beside(columns) <= BESIDE).all(axis=1).astype(np.float64),
+            lambda columns: np.asarray((distances_beside(columns) <= BESIDE).all(axis=1), dtype=np.float64),
         ),
         (
             PaperClaim("vehicles box in the ego: neighbours are nearer", above=False),

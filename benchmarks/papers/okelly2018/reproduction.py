@@ -211,7 +211,8 @@ def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: Float
         again, usual = failing[:FAILING_DRIVEN], ordinary[: ORDINARY_DRIVEN[study.ego]]
         mixed = usual.copy()
         mixed[:, -WEIGHT_COUNT:] = again[np.arange(len(mixed)) % len(again), -WEIGHT_COUNT:]
-        found += compare_behaviour(*(measure_behaviour(problem, x) for x in (again, usual, mixed)), len(failing))
+        driven = [measure_behaviour(problem, x) for x in (again, usual, mixed)]
+        found += compare_behaviour(*driven, all_failing=len(failing))
     return found
 
 

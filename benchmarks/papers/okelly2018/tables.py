@@ -164,12 +164,13 @@ def _ratios_of(
     label: str, head: str, theirs: Mapping[str, float], search: Mapping[str, Any], j: int
 ) -> Iterator[Entry]:
     """Yield the ratios of one search at the j-th threshold."""
-    known, why = search["comparisons"][j] if search["comparisons"] else {}, ("thresholds",)
+    known: Mapping[str, Any] = search["comparisons"][j] if search["comparisons"] else {}
+    why: tuple[str, ...] = ("thresholds",)
     if not known:
         label, missing = f"{label}: {search['iterations']} of {search['of']} iterations run", ("not run",)
     else:  # a standard error of 0 is one below the smallest number
         missing = ("no event",) if known["events_ratio"] is None else ("underflow",)
-    of_weights: tuple[str, ...] = why
+    of_weights = why
     if search["weights_move"]:
         why = of_weights = ("thresholds", "weights", "scale") if "sampler" in search else why
     elif known:

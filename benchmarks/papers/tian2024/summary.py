@@ -29,11 +29,9 @@ INTERVAL_CONFIDENCE = 0.95
 _UPPER = 0.5 + INTERVAL_CONFIDENCE / 2
 _LOWER = 0.5 - INTERVAL_CONFIDENCE / 2
 Ends = tuple[float, float]
-Summaries = pd.DataFrame
-"""A row for each scenario, system and method, see `derive`."""
 
 
-def summarise_runs(runs: Sequence[Run]) -> Summaries:
+def summarise_runs(runs: Sequence[Run]) -> pd.DataFrame:
     """Return figures over the replications of each method; the truth of a system is p by its Monte Carlo."""
     frame = pd.DataFrame(runs, columns=[*ROW_COLUMNS, "p", "final", "simulated", "levels"])
     groups = frame.groupby(list(ROW_COLUMNS), sort=False)
@@ -44,7 +42,7 @@ def summarise_runs(runs: Sequence[Run]) -> Summaries:
     return derive(found)
 
 
-def derive(found: pd.DataFrame) -> Summaries:
+def derive(found: pd.DataFrame) -> pd.DataFrame:
     """Return summaries with what follows from them.
 
     Given are replications, mean and spread (standard deviation) of the estimates of p; simulations (mean number as the
@@ -192,7 +190,7 @@ def assess_claims(runs: Sequence[Run]) -> list[Entry]:
     return [*_efficiency(found, "SS"), *_efficiency(found, "IS"), *_accuracy(found), *_moves(runs)]
 
 
-def _efficiency(found: Summaries, other: str) -> Iterator[Entry]:
+def _efficiency(found: pd.DataFrame, other: str) -> Iterator[Entry]:
     for scenario, system, method in found.index:
         if method == "ADSS" and (scenario, system, other) in found.index:
             ratio, ends = ratio_of_work(found.loc[scenario, system, other], found.loc[scenario, system, "ADSS"])
@@ -201,7 +199,7 @@ def _efficiency(found: Summaries, other: str) -> Iterator[Entry]:
             yield find(claim, statistic, _judge(ends, 1.0), ratio, ends)
 
 
-def _accuracy(found: Summaries) -> Iterator[Entry]:
+def _accuracy(found: pd.DataFrame) -> Iterator[Entry]:
     for scenario, system, method in found.index:
         if method != "IS" or (scenario, system, "MC") not in found.index:
             continue
