@@ -17,14 +17,11 @@ from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods import Auto
 from samplers.output import (
-    Printed,
+    Kept,
     drawing_axes,
     indent_lines,
-    read_object,
     register_stored,
-    require_pandas,
     to_json_value,
-    write_object,
 )
 from samplers.problem import FloatArray, Problem, check_whole, names_of_columns
 from samplers.result import Estimate, without_base
@@ -32,7 +29,6 @@ from samplers.run import Listener, RunArguments, check_problem
 from samplers.sample import Interval, degrees_of_freedom, effective_number, zero_hit_bound
 
 if TYPE_CHECKING:
-    import pandas
     import pyarrow
     from matplotlib.axes import Axes
 
@@ -56,7 +52,7 @@ class Side:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison(Printed):
+class Comparison(Kept):
     """p_A / p_B from the same draws with the same weights.
 
     Example:
@@ -118,19 +114,8 @@ class Comparison(Printed):
         """Return the simulated points behind both, as `Estimate.to_arrow` of `either`; f is the smaller outcome."""
         return self.either.to_arrow(names)
 
-    def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
-        """Return `to_arrow` as a pandas table; needs pandas."""
-        require_pandas()
-        return self.to_arrow(names).to_pandas()
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the comparison to a file that `Comparison.load` reads, as `Estimate.save` does."""
-        write_object(path, replace(self, either=without_base(self.either)))
-
-    @classmethod
-    def load(cls, path: str | PathLike[str]) -> "Comparison":
-        """Return the comparison that `save` has written; raises as `Estimate.load` does."""
-        return read_object(path, cls)
+    def _as_stored(self) -> "Comparison":
+        return replace(self, either=without_base(self.either))
 
     @property
     def _has_ratio(self) -> bool:  # more than a bound: both failed

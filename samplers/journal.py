@@ -13,13 +13,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
 import json
 import os
 import sqlite3
 import stat
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -120,12 +121,7 @@ class Journal:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL, 0o666))  # raises what is wrong with the place
         connection = _connect(path)
         try:
-            connection.execute("BEGIN")
-            for statement in TABLES:
-                connection.execute(statement)
-            row = _Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")
-            connection.execute(INSERT, (*row, row.digest))
-            connection.execute("COMMIT")
+            _fill(connection, [_Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")])
             connection.execute("PRAGMA wal_checkpoint")
         except sqlite3.Error as error:
             connection.close()
@@ -276,6 +272,15 @@ def _connect(path: Path) -> sqlite3.Connection:
     return connection
 
 
+def _fill(connection: sqlite3.Connection, rows: Iterable[_Row]) -> None:
+    """Write the tables of a new journal and records, all or nothing."""
+    connection.execute("BEGIN")
+    for statement in TABLES:
+        connection.execute(statement)
+    connection.executemany(INSERT, ((*row, row.digest) for row in rows))
+    connection.execute("COMMIT")
+
+
 def _count_missing(path: Path) -> int:
     """Return how many bytes are missing at the end of a file by its header; raise unless it is an ordinary one."""
     found = os.stat(path)
@@ -328,12 +333,7 @@ def _keep_before(path: Path, number: int) -> None:
         name.unlink(missing_ok=True)
     new.touch()
     with contextlib.closing(_connect(path)) as damaged, contextlib.closing(_connect(new)) as mended:
-        for statement in TABLES:
-            mended.execute(statement)
-        rows = _good_rows(path, damaged)
-        for _ in range(number):
-            row = next(rows)
-            mended.execute(INSERT, (*row, row.digest))
+        _fill(mended, itertools.islice(_good_rows(path, damaged), number))
     _wal(path).unlink(missing_ok=True)
     os.replace(new, path)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from samplers.problem import FloatArray, needs_library
 
 if TYPE_CHECKING:
+    import pandas
     import pyarrow
     from matplotlib.axes import Axes
 
@@ -211,20 +212,40 @@ def arrow_table(
     return pa.table(table)
 
 
-def require_pandas() -> None:
-    """Raise an ImportError that says what to install where pandas is missing; PyArrow's own names no command."""
-    with needs_library("pandas", "A pandas table"):
-        import_module("pandas")
-
-
 # For people
 
 
-class Printed:
-    """A result that notebooks show as `print` does."""
+class Kept:
+    """What results have in common: notebooks show their text; they become tables, and files that run no code."""
+
+    to_arrow: Callable[..., pyarrow.Table]
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"
+
+    def to_pandas(self, names: Sequence[str] = ()) -> pandas.DataFrame:
+        """Return `to_arrow` as a pandas table; needs pandas."""
+        with needs_library("pandas", "A pandas table"):  # PyArrow's own message names no command
+            import_module("pandas")
+        return (self.to_arrow(names) if names else self.to_arrow()).to_pandas()
+
+    def _as_stored(self) -> object:
+        """Return what a file holds."""
+        return self
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write this to a file that `load` reads, of the format safetensors; an OSError if it cannot be written."""
+        write_object(path, self._as_stored())
+
+    @classmethod
+    def load(cls: type[_Stored], path: str | PathLike[str]) -> _Stored:
+        """Return what `save` has written.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is damaged, or of something else.
+        """
+        return read_object(path, cls)
 
 
 @contextmanager

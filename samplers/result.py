@@ -19,7 +19,7 @@ from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import Share, require_sample, split_by_kind
 from samplers.method import EstimateData, Stepping
 from samplers.output import (
-    Printed,
+    Kept,
     StoredMethod,
     arrow_table,
     drawing_axes,
@@ -27,9 +27,7 @@ from samplers.output import (
     is_stored,
     read_object,
     register_stored,
-    require_pandas,
     to_json_value,
-    write_object,
 )
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import (
@@ -45,7 +43,6 @@ from samplers.sample import (
 )
 
 if TYPE_CHECKING:
-    import pandas
     import pyarrow
     from matplotlib.axes import Axes
 
@@ -54,7 +51,7 @@ PLOTTED_THRESHOLDS = 60
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Estimate(EstimateData, Printed):
+class Estimate(EstimateData, Kept):
     """P[f(X) <= gamma] with its interval, its cost and its failures.
 
     Example:
@@ -324,21 +321,21 @@ class Estimate(EstimateData, Printed):
         own = [f"x.{name}" if name in columns else name for name in self.column_names]
         return arrow_table(columns, missing, x, rows, names or own)
 
-    def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
-        """Return `to_arrow` as a pandas table; needs pandas."""
-        require_pandas()
-        return self.to_arrow(names).to_pandas()
+    def _as_stored(self) -> "StoredEstimate":
+        return StoredEstimate(without_base(self), self.base_uncertainty)  # the base is code
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the estimate to a file that `Estimate.load` reads: all but the base distribution, which is code.
-
-        The file is of the format safetensors, with JSON in its metadata; no code is run when it is read.
+    @classmethod
+    def load(cls, path: str | PathLike[str], base: Distribution | None = None) -> "Estimate":
+        """Return the estimate that `save` has written.
 
         Args:
-            path: Of the file.
+            path: Of the file, in the format safetensors with JSON in its metadata.
+            base: The base distribution (`problem.base`), which `reweight` and `sensitivity` need; `base_uncertainty`
+                is kept without it. A method of another package comes back as its name and settings.
 
         Raises:
-            OSError: If it cannot be written.
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is damaged, or of something else.
 
         Example:
             >>> import samplers
@@ -349,21 +346,6 @@ class Estimate(EstimateData, Printed):
             ...     result.save(f"{folder}/result.safetensors")
             ...     samplers.Estimate.load(f"{folder}/result.safetensors") == result
             True
-        """
-        write_object(path, StoredEstimate(without_base(self), self.base_uncertainty))
-
-    @classmethod
-    def load(cls, path: str | PathLike[str], base: Distribution | None = None) -> "Estimate":
-        """Return the estimate that `save` has written.
-
-        Args:
-            path: Of the file.
-            base: The base distribution (`problem.base`), which `reweight` and `sensitivity` need; `base_uncertainty`
-                is kept without it. A method of another package comes back as its name and settings.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If the file is damaged, or of something else.
         """
         stored = read_object(path, StoredEstimate)
         if base is not None:

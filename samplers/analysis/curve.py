@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,27 +18,21 @@ from samplers.analysis.weighted import (
 )
 from samplers.method import EstimateData
 from samplers.output import (
-    Printed,
+    Kept,
     drawing_axes,
-    read_object,
     register_stored,
-    require_pandas,
     to_json_value,
-    write_object,
 )
 from samplers.problem import FloatArray, needs_library
 from samplers.sample import Sample, add_unseen
 
 if TYPE_CHECKING:
-    import pandas
     import pyarrow
     from matplotlib.axes import Axes
 
-_Curve = TypeVar("_Curve", bound="ProbabilityCurve")
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class ProbabilityCurve(Printed):
+class ProbabilityCurve(Kept):
     """Probabilities over thresholds, with a band that should hold all of them at once; `Curve` and `Exceedance` are.
 
     A subclass has the thresholds as a further field.
@@ -94,25 +88,6 @@ class ProbabilityCurve(Printed):
             import pyarrow as pa
 
         return pa.table(self._columns())
-
-    def to_pandas(self) -> "pandas.DataFrame":
-        """Return `to_arrow` as a pandas table; needs pandas."""
-        require_pandas()
-        return self.to_arrow().to_pandas()
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the curve to a file that `load` reads, of the format safetensors."""
-        write_object(path, self)
-
-    @classmethod
-    def load(cls: type[_Curve], path: str | PathLike[str]) -> _Curve:
-        """Return the curve that `save` has written.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If the file is damaged, or of something else.
-        """
-        return read_object(path, cls)
 
     def __repr__(self) -> str:
         """Return one line; `str` has the table."""
