@@ -7,10 +7,9 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from samplers.analysis.base_error import RatioUncertainty, summarise_ratio
+from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, summarise_refits
 from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
 from samplers.estimation import estimate
@@ -83,7 +82,7 @@ class Comparison(Kept):
     """Reasons for which the numbers are doubtful."""
     either: Estimate = field(repr=False)
     """P[A or B fails], from which all this comes."""
-    base_uncertainty: RatioUncertainty | None = None
+    base_uncertainty: BaseUncertainty | None = None
     """The interval of the ratio that the events behind a fitted base allow; None for a base without refits."""
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
@@ -161,7 +160,7 @@ class Comparison(Kept):
         return {key: to_json_value(value) for key, value in data.items()}
 
 
-register_stored(Comparison, Side, RatioUncertainty)
+register_stored(Comparison, Side)
 
 
 class EitherFails:
@@ -186,14 +185,10 @@ class EitherFails:
 
     def failing_parts(self, x: FloatArray) -> FloatArray:
         """Return 1 where A and where B fails at points x (k, d) that were simulated, 0 elsewhere, shape (2, k)."""
-        return self.failing_sides(x).astype(np.float64)
-
-    def failing_sides(self, x: FloatArray) -> NDArray[np.bool_]:
-        """Return whether A and whether B fails at points x (k, d) that were simulated, shape (2, k)."""
         unknown = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
         if unknown.any():  # mapped there and back in another batch, some coordinate differs by its last bit
             self.evaluate(x[unknown])
-        return np.array([self._known.get(row.tobytes(), (False, False)) for row in x], dtype=bool).reshape(-1, 2).T
+        return np.array([self._known.get(row.tobytes(), (False, False)) for row in x], dtype=float).reshape(-1, 2).T
 
 
 def compare(
@@ -278,7 +273,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     sample = require_sample(either)
     fails = sample.f <= either.gamma
     weights, units = sample.weights[fails], sample.units[fails]
-    which = problem.failing_sides(sample.x)
+    which = problem.failing_parts(sample.x)
     totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
     # the error of the units as `_error` has it for A and B: for A = either, A has the c.o.v. of either
     own = _error(np.bincount(units, weights=weights, minlength=sample.n_units).astype(np.float64))
@@ -299,7 +294,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
         confidence=either.confidence,
         a=a,
         b=b,
-        both=float(weights[which.all(axis=0)].sum()),
+        both=float(weights[which.astype(bool).all(axis=0)].sum()),
         n_sim=n_sim,
         warnings=(*either.warnings, *about),
         either=either,
@@ -309,7 +304,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
 
 def _base_uncertainty(
     totals: FloatArray, factor: float, either: Estimate, problem: EitherFails, sampling: Interval
-) -> RatioUncertainty | None:
+) -> BaseUncertainty | None:
     """Return the uncertainty that the events leave from the unit totals of A and B, shape (2, n_units).
 
     It holds the interval of the sampling, which of few draws is wider than their errors say.
@@ -319,11 +314,14 @@ def _base_uncertainty(
         return None
     p_a, p_b = (float(p) for p in totals.sum(axis=1))
     if p_a == 0 or p_b == 0:
-        return summarise_ratio(_ratio(p_a, p_b), math.inf, None, fitted, either.confidence)
+        why = "one of the two never failed."
+        return summarise_refits(_ratio(p_a, p_b), math.inf, either.confidence, fitted, NO_SUMS, reason=why)
     sums = reweight_runs_to_refits(either, fitted.refits, problem.failing_parts)
     cov = factor * _error(totals[0] / p_a - totals[1] / p_b)
     n_sim = 0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim
-    return summarise_ratio(p_a / p_b, cov, sums, fitted, either.confidence, n_sim, sampling)
+    return summarise_refits(
+        p_a / p_b, cov, either.confidence, fitted, sums, sampling=sampling, n_sim=n_sim, is_ratio=True
+    )
 
 
 def _ratio(a: float, b: float) -> float:

@@ -160,7 +160,7 @@ def compare_with_truth(result: samplers.Estimate, p: float, p_refits: FloatArray
     assert found is not None
     low, high = found.interval or (0.0, found.bound or math.nan)
     known = not found.reason
-    percentiles = np.quantile(found.p_refits, (0.025, 0.975)) if known else (math.nan, math.nan)
+    percentiles = np.quantile(found.value_refits, (0.025, 0.975)) if known else (math.nan, math.nan)
     return Repetition(
         covered=low <= p <= high,
         below=high < p,
@@ -170,7 +170,7 @@ def compare_with_truth(result: samplers.Estimate, p: float, p_refits: FloatArray
         log_width=math.log(high / low) if found.interval else math.nan,
         spread=found.spread,
         further_run=result.ensemble_run is not None,
-        log_errors=tuple(np.log(found.p_refits) - np.log(p_refits)) if known and p_refits is not None else (),
+        log_errors=tuple(np.log(found.value_refits) - np.log(p_refits)) if known and p_refits is not None else (),
     )
 
 

@@ -209,9 +209,9 @@ def compute_severity(
     """Return the severity of failures that were driven again; None where none of them is a collision."""
     failures, any_vehicle = replayed.failures, problem.world.measurement.collisions == "any"
     delta_v, injuries = replayed.severities(any_vehicle)
-    more: list[analysis.FurtherFailures | None] = [None, None]
+    more: list[tuple[analysis.WeightedFailures, FloatArray] | None] = [None, None]
     if further is not None:
-        more = [analysis.FurtherFailures(further.failures, values) for values in further.severities(any_vehicle)]
+        more = [(further.failures, values) for values in further.severities(any_vehicle)]
     collided = np.isfinite(delta_v)
     if not collided.any():
         return None

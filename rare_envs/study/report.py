@@ -289,7 +289,7 @@ class Report:
         known, spread = value > 0 and math.isfinite(cov), {}
         ends, upper, determined = sampling if known else None, sampling[1], known
         if known and uncertainty is not None and math.isfinite(uncertainty.spread):
-            quantile = refit_quantile(uncertainty.confidence, len(uncertainty.p_refits) - 1, uncertainty.clusters)
+            quantile = refit_quantile(uncertainty.confidence, len(uncertainty.value_refits) - 1, uncertainty.clusters)
             spread = {"spread": uncertainty.spread, "fit_bias": FIT_BIAS, "quantile": quantile}
             ends, determined = uncertainty.interval, uncertainty.bound is None
             upper = upper if uncertainty.bound is None else uncertainty.bound

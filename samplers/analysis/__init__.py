@@ -1,11 +1,10 @@
 """Analyses of an estimate without new simulations: thresholds, base distributions, kinds of failure, sensitivities."""
 
-from samplers.analysis.base_error import BaseUncertainty, RatioUncertainty, RefitBand
+from samplers.analysis.base_error import BaseUncertainty, RefitBand
 from samplers.analysis.curve import Curve
 from samplers.analysis.expectation import (
     Exceedance,
     FailureExpectation,
-    FurtherFailures,
     compute_exceedance,
     expect_over_failures,
     expect_under_refits,
@@ -20,8 +19,6 @@ __all__ = [
     "Curve",
     "Exceedance",
     "FailureExpectation",
-    "FurtherFailures",
-    "RatioUncertainty",
     "RefitBand",
     "Reweighted",
     "Sensitivity",

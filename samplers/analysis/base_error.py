@@ -34,7 +34,6 @@ import numpy as np
 
 from samplers.analysis.reweight import (
     FittedBase,
-    RefitFamily,
     RefitSums,
     count_uncovered,
     deviate_within_families,
@@ -70,16 +69,37 @@ NO_SUMS = RefitSums(np.empty((1, 0)), np.empty((1, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefitUncertainty(Reported):
-    """What the spread of a value over the refits of a base says of it."""
+class BaseUncertainty(Reported):
+    """What is known of p, of a mean over failures or of a ratio, given the events that the base was fitted to.
 
+    Example:
+        >>> found = BaseUncertainty(
+        ...     value=7.8e-4, interval=(3.2e-5, 1.9e-2), expected=2e-3, spread=1.4, confidence=0.95,
+        ...     value_refits=(2e-4, 1e-3, 3e-3), ess_refits=(150.0, 200.0, 90.0), clusters=17,
+        ...     fitted_to="38 + 15 events of 17 scenes", family="1 component, log gaps")
+        >>> print(found)  # doctest: +NORMALIZE_WHITESPACE
+        base distribution 95 %  3.2e-05 to 1.9e-02 (38 + 15 events of 17 scenes, 3 refits); predictive mean
+        2e-03
+          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
+    """
+
+    value: float
+    """Under the base distribution itself."""
     interval: Interval | None
     """Interval that should hold the value of the true distribution with probability `confidence`, if that is of the
     fitted family; None where the events do not determine it, or it is not known under the refits."""
+    expected: float | None = None
+    """Probability that the next event fails, the error of the fit averaged: p exp(s^2 / 2) with s the standard
+    deviation of log p over the refits; over several families of refits the sum of such means, by their shares. None for
+    a ratio."""
     spread: float
     """Standard deviation of the value's logarithm over the refits; NaN where it is not known."""
+    bound: float | None = None
+    """Upper end of p in place of an interval, where the events do not determine it (a spread above 2)."""
     confidence: float
     """Nominal coverage of `interval`."""
+    value_refits: tuple[float, ...]
+    """The value under each refit; empty where it is not known."""
     ess_refits: tuple[float, ...]
     """Effective number of failing points behind the value under each refit, for a ratio of the side that has fewer; a
     path of a Markov chain counts as one."""
@@ -96,84 +116,26 @@ class RefitUncertainty(Reported):
     warnings: tuple[str, ...] = ()
     """What makes these numbers doubtful."""
 
-    def _write(self, first: str, values: str) -> str:
-        """Return a few lines for people about `values` under the refits."""
-        if not first:
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        behind = f"({self.fitted_to}, {len(self.value_refits)} refits)"
+        if self.interval is not None:
+            form = ".2g" if self.expected is None else ".1e"
+            low, high = (format(end, form) for end in self.interval)
+            first = f"{100 * self.confidence:g} %  {low} to {high} {behind}"
+            first += "" if self.expected is None else f"; predictive mean {self.expected:.0e}"
+        elif self.bound is not None:
+            below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
+            first = f" the events do not determine p; {below} {behind}"
+        else:
             return f"base distribution  no interval: {self.reason}"
         lines = [
             f"base distribution {first}",
             f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
         ]
         if self.n_sim:
-            lines.append(f"  {values} from a further {self.n_sim:,} simulations under their mixture")
+            lines.append(f"  refits from a further {self.n_sim:,} simulations under their mixture")
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaseUncertainty(RefitUncertainty):
-    """What is known of p, given the events that the base distribution was fitted to.
-
-    Example:
-        >>> found = BaseUncertainty(
-        ...     p=7.8e-4, interval=(3.2e-5, 1.9e-2), expected=2e-3, spread=1.4, bound=None, confidence=0.95,
-        ...     p_refits=(2e-4, 1e-3, 3e-3), ess_refits=(150.0, 200.0, 90.0), clusters=17,
-        ...     fitted_to="38 + 15 events of 17 scenes", family="1 component, log gaps")
-        >>> print(found)  # doctest: +NORMALIZE_WHITESPACE
-        base distribution 95 %  3.2e-05 to 1.9e-02 (38 + 15 events of 17 scenes, 3 refits); predictive mean
-        2e-03
-          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-    """
-
-    p: float
-    """Probability under the base distribution itself."""
-    expected: float | None
-    """Probability that the next event fails, the error of the fit averaged: p exp(s^2 / 2) with s the standard
-    deviation of log p over the refits; over several families of refits the sum of such means, by their shares."""
-    bound: float | None
-    """Upper end in place of an interval, where the events do not determine p (a spread above 2)."""
-    p_refits: tuple[float, ...]
-    """p under each refit; empty where it is not known."""
-
-    def __str__(self) -> str:
-        """Return a few lines for people."""
-        behind, first = f"({self.fitted_to}, {len(self.p_refits)} refits)", ""
-        if self.interval is not None:
-            low, high = self.interval
-            first = f"{100 * self.confidence:g} %  {low:.1e} to {high:.1e} {behind}"
-            first += "" if self.expected is None else f"; predictive mean {self.expected:.0e}"
-        elif self.bound is not None:
-            below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
-            first = f" the events do not determine p; {below} {behind}"
-        return self._write(first, "p of the refits")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RatioUncertainty(RefitUncertainty):
-    """What is known of the ratio of two probabilities, given the events that their base distribution was fitted to.
-
-    Example:
-        >>> found = RatioUncertainty(
-        ...     ratio=1.8, interval=(1.1, 2.9), spread=0.15, confidence=0.95, ratio_refits=(1.7, 1.9, 2.1),
-        ...     ess_refits=(150.0, 200.0, 90.0), clusters=17, fitted_to="38 + 15 events of 17 scenes",
-        ...     family="1 component, log gaps")
-        >>> print(found)
-        base distribution 95 %  1.1 to 2.9 (38 + 15 events of 17 scenes, 3 refits)
-          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-    """
-
-    ratio: float
-    """p_1 / p_2 under the base distribution itself."""
-    ratio_refits: tuple[float, ...]
-    """The ratio under each refit; empty where it is not known."""
-
-    def __str__(self) -> str:
-        """Return a few lines for people."""
-        first = ""
-        if self.interval is not None:
-            low, high = self.interval
-            behind = f"({self.fitted_to}, {len(self.ratio_refits)} refits)"
-            first = f"{100 * self.confidence:g} %  {low:.2g} to {high:.2g} {behind}"
-        return self._write(first, "under the refits")
 
 
 def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
@@ -223,48 +185,53 @@ def summarise_refits(
     n_sim: int = 0,
     doubts: Sequence[str] = (),
     reason: str = "",
+    is_ratio: bool = False,
 ) -> BaseUncertainty:
-    """Return the uncertainty of a probability, or of another mean over failures, from its values under refits."""
-    log_values, ess = sums.log_p[0] + math.log(largest), sums.ess[0]
+    """Return the uncertainty of p, of another mean over failures or of a ratio from its values under refits.
+
+    `largest` is the largest value that a mean can have, in units of which `sums` are; for a ratio, `sums` has the two
+    probabilities. The interval holds that of the sampling, and its upper end what a search of some `lineages` may miss.
+    """
+    log_values, ess = sums.log_p[0] + math.log(largest), sums.ess.min(axis=0)
+    if is_ratio and not reason:
+        known = np.isfinite(sums.log_p).all(axis=0)
+        log_values = np.where(known, np.subtract(*np.where(known, sums.log_p, 0.0)), -np.inf)
     reason = reason or _explain_missing_spread(log_values, fitted.clusters)
     interval, expected, spread, bound = None, None, math.nan, None
     if not reason:
-        spread, families, (low, high) = _spread_to_ends(value, log_values, cov, confidence, fitted, lineages)
-        ends = _hold((low_factor * low, min(largest, high)), sampling)
+        families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
+        ends = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
+        low, high = low_factor * _exp(ends[0]), _exp(ends[1])
+        high = high if is_ratio else min(largest, high)
+        if sampling is not None:
+            low, high = min(low, sampling[0]), max(high, sampling[1])
+        spread = float(log_values.std(ddof=1))
         if spread <= MAX_SPREAD:
-            interval, expected = ends, expect_over_families(families, largest)
+            interval, expected = (low, high), None if is_ratio else expect_over_families(families, largest)
+        elif is_ratio:
+            reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
         else:
-            bound = ends[1]
+            bound = high
+    with np.errstate(over="ignore"):
+        values = np.exp(log_values)
+    few = count_uncovered(ess)
+    coarse = [f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse."]
     return BaseUncertainty(
-        p=value,
+        value=value,
         interval=interval,
         expected=expected,
         spread=spread,
         bound=bound,
         reason=reason,
         confidence=confidence,
-        p_refits=tuple(float(each) for each in np.exp(log_values)),
+        value_refits=tuple(float(each) for each in values),
         ess_refits=tuple(float(each) for each in ess),
         clusters=fitted.clusters,
         fitted_to=fitted.fitted_to,
         family=fitted.family,
         n_sim=n_sim,
-        warnings=(*_describe_coverage(ess), *doubts),
+        warnings=(*(coarse if few else ()), *doubts),
     )
-
-
-def _spread_to_ends(
-    value: float, log_values: FloatArray, cov: float, confidence: float, fitted: FittedBase, lineages: float = math.inf
-) -> tuple[float, tuple[RefitFamily, ...], Interval]:
-    """Return the spread of values (R,) under refits, as logarithms, their families and the ends of the value."""
-    families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
-    low, high = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
-    return float(log_values.std(ddof=1)), families, (_exp(low), _exp(high))
-
-
-def _hold(interval: Interval, sampling: Interval | None) -> Interval:
-    """Return an interval, widened to hold that of the sampling if there is one."""
-    return interval if sampling is None else (min(interval[0], sampling[0]), max(interval[1], sampling[1]))
 
 
 def _explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
@@ -282,19 +249,12 @@ def _exp(exponent: float) -> float:
     return math.exp(exponent) if exponent < math.log(np.finfo(np.float64).max) else math.inf
 
 
-def _describe_coverage(ess: FloatArray) -> tuple[str, ...]:
-    """Return a warning if more than a tenth of the refits rest on under 10 effective failing points (R,)."""
-    few = count_uncovered(ess)
-    text = f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse."
-    return (text,) if few else ()
-
-
 def read_lineages(estimate: EstimateData) -> float:
     """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
     return math.inf if estimate.sample is None else estimate.sample.lineages
 
 
-def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> RatioUncertainty:
+def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> BaseUncertainty:
     """Return p_1 / p_2 of two estimates with the interval that the events behind their base distribution allow.
 
     The two are estimates of their own on the same base distribution, of two egos for example. `samplers.compare`
@@ -324,55 +284,14 @@ def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> Rati
             "one confidence=..."
         )
     one, two = (reweight_runs_to_refits(each, base.refits) for each, base in zip((first, second), bases, strict=True))
-    return summarise_ratio(
+    return summarise_refits(
         first.p / second.p,
         math.hypot(first.cov, second.cov),
-        RefitSums(np.concatenate([one.log_p, two.log_p]), np.concatenate([one.ess, two.ess])),
-        bases[0],
         first.confidence,
-        sum(each.ensemble_run.n_sim for each in (first, second) if each.ensemble_run is not None),
-    )
-
-
-def summarise_ratio(
-    ratio: float,
-    cov: float,
-    sums: RefitSums | None,
-    fitted: FittedBase,
-    confidence: float,
-    n_sim: int = 0,
-    sampling: Interval | None = None,
-) -> RatioUncertainty:
-    """Return the uncertainty of a ratio whose logarithm has the standard error `cov`.
-
-    `sums` has the two probabilities under R refits, shape (2, R); None where one of them is 0 in the run itself.
-    """
-    log_ratios, ess, reason = np.empty(0), np.empty(0), "one of the two never failed."
-    if sums is not None:
-        known = np.isfinite(sums.log_p).all(axis=0)
-        log_ratios = np.where(known, np.subtract(*np.where(known, sums.log_p, 0.0)), -np.inf)
-        ess = sums.ess.min(axis=0)
-        reason = _explain_missing_spread(log_ratios, fitted.clusters)
-    interval, spread = None, math.nan
-    if not reason:
-        spread, _, ends = _spread_to_ends(ratio, log_ratios, cov, confidence, fitted)
-        if spread > MAX_SPREAD:
-            reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
-        else:
-            interval = _hold(ends, sampling)
-    return RatioUncertainty(
-        ratio=ratio,
-        interval=interval,
-        spread=spread,
-        confidence=confidence,
-        ratio_refits=tuple(_exp(float(each)) for each in log_ratios),
-        ess_refits=tuple(float(each) for each in ess),
-        clusters=fitted.clusters,
-        fitted_to=fitted.fitted_to,
-        family=fitted.family,
-        n_sim=n_sim,
-        reason=reason,
-        warnings=_describe_coverage(ess),
+        bases[0],
+        RefitSums(np.concatenate([one.log_p, two.log_p]), np.concatenate([one.ess, two.ess])),
+        n_sim=sum(each.ensemble_run.n_sim for each in (first, second) if each.ensemble_run is not None),
+        is_ratio=True,
     )
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +24,6 @@ from samplers.analysis.weighted import (
     MIN_UNITS,
     Reported,
     WeightedFailures,
-    interval_of_sum,
     require_sample,
     simultaneous_intervals,
     unit_sums,
@@ -31,11 +31,13 @@ from samplers.analysis.weighted import (
 from samplers.method import EstimateData
 from samplers.output import drawing_axes
 from samplers.problem import FloatArray
-from samplers.sample import Interval, Sample, effective_number
+from samplers.sample import Interval, Sample
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+FailureValues: TypeAlias = tuple[WeightedFailures, FloatArray]
+"""Failing points of a run with a quantity at them, shape (k,)."""
 NOWHERE = 1e308
 """Stands for the f of points that exceed no threshold: above all thresholds, and finite."""
 
@@ -88,35 +90,14 @@ def expect_over_failures(
     largest = float(h.max())
     if largest == 0:
         raise ValueError("The quantity is 0 at every failing point: its expectation has no interval.")
-    terms = failures.weights * h
-    value, cov = float(terms.sum()), failures.cov_of_sum(terms)
-    units = effective_number(failures.unit_totals(terms))
-    # in units of the largest value, so that the cut at 1 is the bound h <= largest
-    low, high = interval_of_sum(value / largest, cov, units, failures.independent, confidence)
+    value, cov, interval = failures.estimate_sum(failures.weights * h, confidence, largest)
     return FailureExpectation(
         value=value,
-        interval=(low * largest, high * largest),
+        interval=interval,
         confidence=confidence,
         cov=cov,
         per_failure=value / float(failures.weights.sum()),
     )
-
-
-class FurtherFailures(NamedTuple):
-    """Failing points of the further run under the mixture of the refits, with a quantity at them.
-
-    Example:
-        >>> import samplers
-        >>> from samplers.analysis.weighted import weigh_failures
-        >>> problem = samplers.FunctionProblem(lambda x: 1.0 - x[:, 0], dim=2)
-        >>> failures = weigh_failures(samplers.estimate(problem, "mc", seed=0, max_sim=1000))
-        >>> bool((FurtherFailures(failures, failures.x[:, 0]).values >= 1.0).all())
-        True
-    """
-
-    failures: WeightedFailures
-    values: FloatArray
-    """Shape (k,)."""
 
 
 def expect_under_refits(
@@ -124,7 +105,7 @@ def expect_under_refits(
     failures: WeightedFailures,
     values: FloatArray,
     expectation: FailureExpectation,
-    further: FurtherFailures | None = None,
+    further: FailureValues | None = None,
 ) -> BaseUncertainty | None:
     """Return the uncertainty of E[h(X); failure] that the events behind a fitted base leave, as that of p.
 
@@ -133,10 +114,11 @@ def expect_under_refits(
         failures: Its weighted failing points.
         values: h at these points, shape (k,).
         expectation: E[h(X); failure] under the base itself.
-        further: The same of the run's `ensemble_run`, if it has one; without it the points of the run itself count.
+        further: Failing points of the run's `ensemble_run`, if it has one, and h at them; without it the points of the
+            run itself count.
 
     Returns:
-        Its `p` is the expectation; None where the base has no refits.
+        Its `value` is the expectation; None where the base has no refits.
 
     Example:
         h = 2 at every failing point, P[x >= 1] under N(0, 1) and under its refits N(-0.2, 1), N(0, 1) and N(0.2, 1):
@@ -154,17 +136,19 @@ def expect_under_refits(
         >>> failures = weigh_failures(result)
         >>> h = np.full(len(failures.x), 2.0)
         >>> found = expect_under_refits(result, failures, h, expect_over_failures(failures, h))
-        >>> [round(value, 2) for value in found.p_refits]
+        >>> [round(value, 2) for value in found.value_refits]
         [0.23, 0.32, 0.42]
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
         return None
-    largest = max(float(np.max(values)), 0.0 if further is None else float(np.max(further.values)))
-    more = None if further is None else (further.failures, further.values[None] / largest)
+    pairs = [(failures, np.asarray(values, dtype=np.float64)), further]
+    largest = max(float(each[1].max()) for each in pairs if each is not None)
     sums, reason = NO_SUMS, ""
     try:
-        sums = _sum_parts_under_refits(estimate, fitted, (failures, values[None] / largest), more)
+        sums = _sum_parts_under_refits(
+            estimate, fitted, [None if each is None else (each[0], each[1][None] / largest) for each in pairs]
+        )
     except ValueError as error:
         reason = str(error)
     return summarise_refits(
@@ -182,30 +166,23 @@ def expect_under_refits(
 
 
 def _sum_parts_under_refits(
-    estimate: EstimateData,
-    fitted: FittedBase,
-    own: tuple[WeightedFailures, FloatArray],
-    further: tuple[WeightedFailures, FloatArray] | None = None,
+    estimate: EstimateData, fitted: FittedBase, pairs: Sequence[FailureValues | None]
 ) -> RefitSums:
     """Return m parts of p under R refits, each from the run or its further run, whichever has more points for it.
 
-    `own` has the weighted failing points of the run and what share of each belongs to each part, shape (m, k),
-    `further` those of its `ensemble_run`.
+    `pairs` has weighted failing points of the run, and of its `ensemble_run` if it has one, with the share of each
+    point that belongs to each part, shape (m, k).
     """
-    found = [reweight_to_refits(estimate, fitted.refits, _spread_over_all(estimate, *own))]
-    run = estimate.ensemble_run
-    if further is not None and run is not None:
-        found.append(reweight_to_refits(run, fitted.refits, _spread_over_all(run, *further)))
+    found = []
+    for run, pair in zip((estimate, estimate.ensemble_run), pairs, strict=True):
+        if run is None or pair is None:
+            continue
+        (failures, shares), sample = pair, require_sample(run)
+        weights = sample.weights[sample.f <= run.gamma]
+        parts = np.zeros((len(shares), failures.total))  # of all points, which add up to the same parts of p
+        parts[:, failures.rows] = shares * (weights.sum() / weights[failures.rows].sum())
+        found.append(reweight_to_refits(run, fitted.refits, parts))
     return choose_better_run(found)
-
-
-def _spread_over_all(estimate: EstimateData, failures: WeightedFailures, shares: FloatArray) -> FloatArray:
-    """Return shares (m, k) of some failing points as shares (m, total) of all, which add up to the same parts of p."""
-    sample = require_sample(estimate)
-    weights = sample.weights[sample.f <= estimate.gamma]
-    parts = np.zeros((len(shares), failures.total))
-    parts[:, failures.rows] = shares * (weights.sum() / weights[failures.rows].sum())
-    return parts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -266,7 +243,7 @@ def compute_exceedance(
     failures: WeightedFailures,
     values: FloatArray,
     thresholds: ArrayLike,
-    further: FurtherFailures | None = None,
+    further: FailureValues | None = None,
 ) -> Exceedance:
     """Return P[failure and v > t] over thresholds t, with a simultaneous (sup-t) band as that of `Estimate.curve`.
 
@@ -277,7 +254,8 @@ def compute_exceedance(
         failures: Its weighted failing points.
         values: v at these points, shape (k,); -inf where it exceeds no threshold.
         thresholds: Thresholds t, in any order.
-        further: Failing points of the run's `ensemble_run` with v, if it has one; they count for the refits alone.
+        further: Failing points of the run's `ensemble_run`, if it has one, and v at them; they count for the refits
+            alone.
 
     Example:
         v = x_1 where x_2 > 0, in plain draws from N(0, I): Phi(-1) / 2 = 0.079 and Phi(-2) / 2 = 0.011.
@@ -322,8 +300,8 @@ def compute_exceedance(
 
 def _band_under_refits(
     estimate: EstimateData,
-    own: tuple[WeightedFailures, FloatArray],
-    further: FurtherFailures | None,
+    own: FailureValues,
+    further: FailureValues | None,
     thresholds: FloatArray,
     sampling: tuple[FloatArray, FloatArray, FloatArray],
 ) -> RefitBand | None:
@@ -339,9 +317,8 @@ def _band_under_refits(
         None if each is None else (each[0], (each[1] > thresholds[:, None]).astype(np.float64))
         for each in (own, further)
     ]
-    assert beyond[0] is not None
     try:
-        sums = _sum_parts_under_refits(estimate, fitted, beyond[0], beyond[1])
+        sums = _sum_parts_under_refits(estimate, fitted, beyond)
     except ValueError:  # p itself is not known under the refits, as `BaseUncertainty` says
         return None
     band = compute_refit_band(

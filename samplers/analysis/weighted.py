@@ -233,6 +233,13 @@ class WeightedFailures:
             return math.inf
         return self.inflation * math.sqrt(max(1 / effective - 1 / self.n_units, 0.0))
 
+    def estimate_sum(self, terms: FloatArray, confidence: float, largest: float = 1.0) -> tuple[float, float, Interval]:
+        """Return the sum of terms (k,) > 0 with its c.o.v. and interval; `largest` is the largest mean there can be."""
+        value, cov, units = float(terms.sum()), self.cov_of_sum(terms), effective_number(self.unit_totals(terms))
+        # in units of the largest value, so that the cut at 1 is the bound
+        low, high = interval_of_sum(value / largest, cov, units, self.independent, confidence)
+        return value, cov, (low * largest, high * largest)
+
     def mean_of(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return E[h(X) | failure] and its standard error, (m,) each, of m quantities h (k, m) at these points.
 
@@ -278,13 +285,21 @@ def weigh_failures(estimate: EstimateData, most: int | None = None) -> WeightedF
         >>> bool(np.allclose(failures.weights, 1 / 1000))  # plain draws
         True
     """
+    rows = choose_failures(require_sample(estimate), estimate.gamma, most)
+    found = _weigh_rows(estimate, rows)
+    if found is None:
+        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to analyse.")
+    return found
+
+
+def _weigh_rows(estimate: EstimateData, rows: NDArray[np.int64]) -> WeightedFailures | None:
+    """Return the failing points with these rows of `Sample.x`, weighted; None where they have no weight."""
     sample = require_sample(estimate)
     failing = np.flatnonzero(sample.f <= estimate.gamma)
-    rows = choose_failures(sample, estimate.gamma, most)
     chosen = failing[rows]
     weights = sample.weights[chosen]
     if not weights.sum() > 0:
-        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to analyse.")
+        return None
     raw = WeightedFailures(
         x=sample.x[rows],
         rows=rows,
@@ -363,32 +378,19 @@ def sum_by_label(estimate: EstimateData, rows: NDArray[np.int64], labels: NDArra
         >>> {label: share.points for label, share in shares.items()}
         {'even': 8, 'odd': 8}
     """
-    sample = require_sample(estimate)
-    chosen = np.flatnonzero(sample.f <= estimate.gamma)[rows]
-    everything = _sum_points(sample, chosen, estimate.gamma)
-    total, grow = float(everything.p[0]), cov_inflation(estimate, float(everything.cov[0]))
-    kinds = {kind: chosen[labels == kind] for kind in dict.fromkeys(labels.tolist())}
-    shares = {kind: _share_of(estimate, sample, mine, total, grow) for kind, mine in kinds.items()}
-    if len(shares) == 1 and estimate.p > 0:  # all of p: its interval is that of p
+    failures, shares = _weigh_rows(estimate, rows), dict[str, Share]()
+    if failures is None:
+        return shares
+    n, weights = failures.n_units, require_sample(estimate).weights
+    unscaled = np.isclose(weights[require_sample(estimate).f <= estimate.gamma][rows].sum(), estimate.p, rtol=1e-9)
+    for kind in dict.fromkeys(labels.tolist()):
+        terms = failures.weights * (labels == kind)
+        p, cov, interval = failures.estimate_sum(terms, estimate.confidence)
+        if unscaled and np.isclose((failures.unit_totals(terms) ** 2).sum() * n, p, rtol=1e-9, atol=0.0):  # a count
+            cov = cov / failures.inflation
+            interval = clopper_pearson(round(p * n), n, estimate.confidence)
+        points = int(np.count_nonzero(labels == kind))
+        shares[kind] = Share(p=p, interval=interval, cov=cov, of_failures=p / estimate.p, points=points)
+    if len(shares) == 1:  # all of p: its interval is that of p
         shares = {kind: replace(share, interval=estimate.interval, cov=estimate.cov) for kind, share in shares.items()}
     return dict(sorted(shares.items(), key=lambda each: -each[1].p))
-
-
-def _sum_points(sample: Sample, rows: NDArray[np.int64], gamma: float) -> UnitSums:
-    """Return the sum of the weights of some points with its spread, as if only they had f <= gamma."""
-    f = np.full(len(sample.f), np.inf)
-    f[rows] = gamma
-    return unit_sums(replace(sample, f=f, layers=()), np.array([gamma]))
-
-
-def _share_of(estimate: EstimateData, sample: Sample, rows: NDArray[np.int64], total: float, grow: float) -> Share:
-    """Return the share of the points with these rows; the weights of all failing points add up to `total`."""
-    sums = _sum_points(sample, rows, estimate.gamma)
-    part = float(sums.p[0]) / total if total > 0 else 0.0
-    p, cov = estimate.p * part, float(sums.cov[0])
-    if sums.is_count[0] and np.isclose(total, estimate.p, rtol=1e-9):
-        interval = clopper_pearson(round(p * sums.n_units), sums.n_units, estimate.confidence)
-    else:
-        cov *= grow
-        interval = interval_of_sum(p, cov, float(sums.ess[0]), has_independent_points(sample), estimate.confidence)
-    return Share(p=p, interval=interval, cov=cov, of_failures=part, points=len(rows))

@@ -234,7 +234,7 @@ def test_curve_and_injuries_have_the_intervals_of_a_fitted_base() -> None:
     estimate = samplers.estimate(problem, seed=0, max_sim=2500)
     severity = severity_curve(problem, estimate, thresholds=[-1.0, 1.0])
     wide = severity.injuries_base
-    assert wide.p == severity.injuries.value
+    assert wide.value == severity.injuries.value
     assert wide.interval[0] < severity.injuries.interval[0] < severity.injuries.interval[1] < wide.interval[1]
     curve, band = severity.curve, severity.curve.base
     assert (band.low < curve.low).all() and (curve.high < band.high).all()

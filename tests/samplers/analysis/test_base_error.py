@@ -29,15 +29,15 @@ def test_the_interval_by_hand():
     """30 refits of 17 scenes: 16 degrees of freedom; t = 2.120. Plain draws miss no region."""
     result = after(run(BASE), math.inf)
     found = result.base_uncertainty
-    spread = np.std(np.log(found.p_refits), ddof=1)
+    spread = np.std(np.log(found.value_refits), ddof=1)
     half = 2.119905 * math.sqrt(spread**2 + result.cov**2 + 0.04)
     assert found.interval == pytest.approx((result.p * math.exp(-half), result.p * math.exp(half)), rel=1e-6)
     assert found.expected == pytest.approx(result.p * math.exp(spread**2 / 2))
     assert found.spread == pytest.approx(spread)
-    assert (found.p, found.bound, found.reason, found.n_sim) == (result.p, None, "", 0)
+    assert (found.value, found.bound, found.reason, found.n_sim) == (result.p, None, "", 0)
     exact = np.log([refit.p for refit in SHIFTED])
     assert found.spread == pytest.approx(exact.std(ddof=1), rel=0.05)
-    assert np.log(found.p_refits) == pytest.approx(exact, abs=0.3)
+    assert np.log(found.value_refits) == pytest.approx(exact, abs=0.3)
 
 
 def test_the_upper_end_holds_what_a_search_may_have_missed():
@@ -45,10 +45,10 @@ def test_the_upper_end_holds_what_a_search_may_have_missed():
     without, found = (after(run(BASE), lineages).base_uncertainty for lineages in (math.inf, 3.0))
     assert (found.interval[0], found.spread, found.expected) == (without.interval[0], without.spread, without.expected)
     rng = np.random.default_rng(0)
-    sigma = math.log(without.interval[1] / without.p) / stats.norm.ppf(0.975)
+    sigma = math.log(without.interval[1] / without.value) / stats.norm.ppf(0.975)
     drawn = sigma * rng.standard_normal(10**6) - np.log1p(-rng.beta(0.1, 3.0, 10**6))
-    assert np.quantile(drawn, 0.975) > math.log(without.interval[1] / without.p) + 0.03
-    assert math.log(found.interval[1] / found.p) == pytest.approx(np.quantile(drawn, 0.975), abs=0.02)
+    assert np.quantile(drawn, 0.975) > math.log(without.interval[1] / without.value) + 0.03
+    assert math.log(found.interval[1] / found.value) == pytest.approx(np.quantile(drawn, 0.975), abs=0.02)
 
 
 def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
@@ -145,7 +145,7 @@ def test_the_further_run_knows_p_of_the_refits_and_leaves_p_as_it_is():
     assert (result.p, result.interval, result.n_sim) == (without.p, without.interval, without.n_sim)
     found = result.base_uncertainty
     assert 0 < found.n_sim == result.ensemble_run.n_sim <= 3000  # max_sim limits it anew
-    assert np.log(found.p_refits) == pytest.approx(np.log([refit.p for refit in FAR]), abs=0.3)
+    assert np.log(found.value_refits) == pytest.approx(np.log([refit.p for refit in FAR]), abs=0.3)
     assert min(found.ess_refits) > 10
     assert f"from a further {found.n_sim:,} simulations under their mixture" in str(result)
     assert sum(ess < 10 for ess in without.base_uncertainty.ess_refits) == 4

@@ -10,7 +10,7 @@ from scipy import stats
 
 from samplers.analysis import base_error
 from samplers.analysis.base_error import compute_refit_band
-from samplers.analysis.expectation import FurtherFailures, compute_exceedance, expect_over_failures, expect_under_refits
+from samplers.analysis.expectation import compute_exceedance, expect_over_failures, expect_under_refits
 from samplers.analysis.reweight import RefitSums
 from samplers.analysis.weighted import weigh_failures
 from samplers.sample import raise_log_end
@@ -49,7 +49,7 @@ def test_the_uncertainty_of_one_under_refits_is_that_of_p():
     ones = np.ones(len(failures.x))
     found = expect_under_refits(result, failures, 2 * ones, expect_over_failures(failures, 2 * ones))
     whole = result.base_uncertainty
-    assert found.p_refits == pytest.approx([2 * p for p in whole.p_refits])
+    assert found.value_refits == pytest.approx([2 * p for p in whole.value_refits])
     assert found.spread == pytest.approx(whole.spread)
     assert found.interval == pytest.approx(tuple(2 * end for end in whole.interval), rel=0.01)
     assert found.expected == pytest.approx(2 * whole.expected)
@@ -62,7 +62,7 @@ def test_expectations_under_refits_are_those_of_the_tail():
     failures = weigh_failures(result, most=1500)
     beyond = -result.sample.f[result.sample.f <= 0][failures.rows]
     found = expect_under_refits(result, failures, beyond, expect_over_failures(failures, beyond))
-    for refit, value in zip(base.refits, found.p_refits, strict=True):
+    for refit, value in zip(base.refits, found.value_refits, strict=True):
         mean = ALPHA @ ((refit.mean - base.mean) / base.sd)
         sd = np.sqrt(ALPHA**2 @ (refit.sd / base.sd) ** 2)
         z = (BETA - mean) / sd
@@ -89,12 +89,12 @@ def test_points_of_the_further_run_count_where_the_first_has_few():
     failures, more = weigh_failures(result), weigh_failures(result.ensemble_run)
     ones = np.ones(len(failures.x))
     one = expect_over_failures(failures, ones)
-    both = expect_under_refits(result, failures, ones, one, FurtherFailures(more, np.ones(len(more.x))))
+    both = expect_under_refits(result, failures, ones, one, (more, np.ones(len(more.x))))
     alone = expect_under_refits(result, failures, ones, one)
-    assert both.p_refits == pytest.approx(result.base_uncertainty.p_refits)
+    assert both.value_refits == pytest.approx(result.base_uncertainty.value_refits)
     assert both.n_sim == result.ensemble_run.n_sim
     assert min(alone.ess_refits) < 10 < min(both.ess_refits)
-    assert both.p_refits == pytest.approx([refit.p for refit in base.refits], rel=0.3)
+    assert both.value_refits == pytest.approx([refit.p for refit in base.refits], rel=0.3)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -14,13 +14,13 @@ from samplers.analysis.gate import Pilot, judge_estimate, plan_runs
 from samplers.limit_states import half_space
 
 BASE = BaseUncertainty(
-    p=1e-4,
+    value=1e-4,
     interval=(1e-5, 1e-3),
     expected=2e-4,
     spread=1.0,
     bound=None,
     confidence=0.9,
-    p_refits=(1e-4, 2e-4),
+    value_refits=(1e-4, 2e-4),
     ess_refits=(50.0, 50.0),
     clusters=17,
     fitted_to="38 events",

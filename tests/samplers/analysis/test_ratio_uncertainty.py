@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.base_error import summarise_ratio
+from samplers.analysis.base_error import summarise_refits
 from samplers.analysis.reweight import RefitSums
 from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled
 
@@ -32,14 +32,14 @@ def exact_ratios(refits, betas=(3.0, 3.3)):
 
 def test_the_ratio_under_each_refit_is_the_exact_one():
     found = samplers.compute_ratio_uncertainty(*estimates())
-    assert np.log(found.ratio_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
-    assert found.ratio == pytest.approx(exact_ratios([normal()])[0], rel=0.1)
+    assert np.log(found.value_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
+    assert found.value == pytest.approx(exact_ratios([normal()])[0], rel=0.1)
 
 
 def test_the_interval_by_hand():
     first, second = estimates()
     found = samplers.compute_ratio_uncertainty(first, second)
-    pairs = zip(first.base_uncertainty.p_refits, second.base_uncertainty.p_refits, strict=True)
+    pairs = zip(first.base_uncertainty.value_refits, second.base_uncertainty.value_refits, strict=True)
     spread = np.std([math.log(a / b) for a, b in pairs], ddof=1)
     half = 2.119905 * math.sqrt(spread**2 + first.cov**2 + second.cov**2 + 0.04)
     ratio = first.p / second.p
@@ -52,15 +52,15 @@ def test_two_sides_of_one_run():
     base = BASE
     found = samplers.compare(HalfSpace(base, 3.0), HalfSpace(base, 3.3), seed=2, max_sim=6000)
     ratio = found.base_uncertainty
-    assert np.log(ratio.ratio_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
-    assert ratio.ratio == found.ratio
+    assert np.log(ratio.value_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
+    assert ratio.value == found.ratio
     assert ratio.interval[0] < found.interval[0] < found.interval[1] < ratio.interval[1]
     whole = found.either.base_uncertainty
     assert math.log(ratio.interval[1] / ratio.interval[0]) < 0.5 * math.log(whole.interval[1] / whole.interval[0])
     text = str(found)
     assert f"  base distribution 95 %  {ratio.interval[0]:.2g} to {ratio.interval[1]:.2g} (38 + 15 events" in text
     assert "errors of the family are not included" in text
-    assert json.loads(json.dumps(found.to_dict()))["base_uncertainty"]["ratio_refits"] == list(ratio.ratio_refits)
+    assert json.loads(json.dumps(found.to_dict()))["base_uncertainty"]["value_refits"] == list(ratio.value_refits)
 
 
 def test_the_further_run_of_a_comparison_simulates_both():
@@ -76,7 +76,7 @@ def test_the_further_run_of_a_comparison_simulates_both():
     assert found.n_sim + found.base_uncertainty.n_sim == sum(rows)
     assert 0 < found.n_sim <= 6000
     assert 0 < found.base_uncertainty.n_sim <= 6000
-    assert np.log(found.base_uncertainty.ratio_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
+    assert np.log(found.base_uncertainty.value_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
     assert f"{found.base_uncertainty.n_sim:,} simulations under their mixture" in str(found)
     forbidden = samplers.compare(Counting(base, 3.0), Counting(base, 3.3), seed=2, max_sim=6000, ensemble_run=False)
     assert forbidden.base_uncertainty.n_sim == 0
@@ -97,18 +97,18 @@ def test_one_that_never_fails_leaves_no_interval():
     assert found.interval is None
     assert found.reason == "one of the two never failed."
     assert str(found) == "base distribution  no interval: one of the two never failed."
-    assert found.to_dict()["ratio"] is None
+    assert found.to_dict()["value"] is None
 
 
 def test_ratios_that_the_events_do_not_determine():
     base = BASE
     log_p = np.stack([np.linspace(-20.0, -1.0, 30), np.full(30, -5.0)])
-    found = summarise_ratio(2.0, 0.1, RefitSums(log_p, np.full((2, 30), 50.0)), base, 0.95)
+    found = summarise_refits(2.0, 0.1, 0.95, base, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert found.interval is None
     assert found.spread == pytest.approx(log_p[0].std(ddof=1))
     assert "the events do not determine the ratio: the spread of its logarithm is 5." in str(found)
     log_p[1, 3] = -np.inf
-    unknown = summarise_ratio(2.0, 0.1, RefitSums(log_p, np.full((2, 30), 50.0)), base, 0.95)
+    unknown = summarise_refits(2.0, 0.1, 0.95, base, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert unknown.reason.startswith("1 of 30 refits have no density")
     assert math.isnan(unknown.spread)
 
