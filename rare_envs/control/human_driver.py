@@ -82,10 +82,6 @@ class Glances(NamedTuple):
         """Return whose eyes are off the road at a time [s], boolean, shape (B,)."""
         return ((self.start <= time) & (time < self.end)).any(dim=1)
 
-    def number_at(self, time: float) -> Tensor:
-        """Return how many have begun by a time [s], int64, shape (B,)."""
-        return (self.start <= time).sum(dim=1)
-
 
 def count_glance_draws(horizon: float) -> int:
     """Return how many standard normal draws the glances of an episode [s] take: 5 deviations more than begin."""
@@ -93,20 +89,15 @@ def count_glance_draws(horizon: float) -> int:
     return START_DRAWS + 2 * math.ceil(mean + 5.0 * math.sqrt(mean) + 2.0)
 
 
-def glance_duration(share: Tensor) -> Tensor:
-    """Return the duration [s] that a share of all glances does not exceed: the quantile function, any shape."""
-    return _interpolate(share, [p for _, p in GLANCE_CDF], [d for d, _ in GLANCE_CDF])
-
-
 def remaining_duration(share: Tensor) -> Tensor:
-    """Return the same quantile of what is left of a glance at a moment of eyes off the road [s].
+    """Return the quantile of what is left of a glance at a moment of eyes off the road [s], by shares (B,).
 
     In a stationary sequence it has the density P[duration > r] / mean duration (Cox, "Renewal theory", 1962).
     """
     time, probability = np.linspace(0.0, GLANCE_CDF[-1][0], 268), np.array(GLANCE_CDF)
     longer = 1.0 - np.interp(time, probability[:, 0], probability[:, 1])
     cdf = np.concatenate(([0.0], np.cumsum((longer[1:] + longer[:-1]) / 2 * np.diff(time))))
-    return _interpolate(share, (cdf / cdf[-1]).tolist(), time.tolist())
+    return _interpolate(share, tuple((cdf / cdf[-1]).tolist()), tuple(time.tolist()))
 
 
 def draw_glances(draws: Tensor) -> Glances:
@@ -117,14 +108,16 @@ def draw_glances(draws: Tensor) -> Glances:
     """
     share = torch.special.ndtr(draws).clamp(1e-7, 1.0 - 1e-7)
     left = torch.where(share[:, 0] < OFF_ROAD_SHARE, remaining_duration(share[:, 1]), 0.0)[:, None]
-    between, lasting = -MEAN_ON_ROAD * torch.log1p(-share[:, START_DRAWS::2]), glance_duration(share[:, 3::2])
+    duration, no_longer = zip(*GLANCE_CDF, strict=True)
+    between = -MEAN_ON_ROAD * torch.log1p(-share[:, START_DRAWS::2])
+    lasting = _interpolate(share[:, 3::2], no_longer, duration)
     end = left + (between + lasting).cumsum(dim=1)
     return Glances(torch.cat((torch.zeros_like(left), end - lasting), dim=1), torch.cat((left, end), dim=1))
 
 
-def _interpolate(value: Tensor, known: list[float], result: list[float]) -> Tensor:
+def _interpolate(value: Tensor, known: tuple[float, ...], result: tuple[float, ...]) -> Tensor:
     """Return piecewise linear interpolation between increasing `known` values, as `numpy.interp`."""
-    x, y = constant(tuple(known), value), constant(tuple(result), value)
+    x, y = constant(known, value), constant(result, value)
     right = torch.searchsorted(x, value.contiguous()).clamp(1, len(known) - 1)
     share = ((value - x[right - 1]) / (x[right] - x[right - 1])).clamp(0.0, 1.0)
     return y[right - 1] + share * (y[right] - y[right - 1])

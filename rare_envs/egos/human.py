@@ -170,7 +170,7 @@ class HumanDriver:
         if self.glances is None:
             return memory.glance, memory.away
         time = max(0, memory.tick - self.delay) * self.world.clock.dt
-        due = self.glances.number_at(time)
+        due = (self.glances.start <= time).sum(dim=1)  # how many have begun
         begun = torch.where(due == memory.glance, memory.away, inverse_tau(late, speed) <= MOST_URGENT_GLANCE)
         return due, begun & self.glances.off_road(time)
 

@@ -58,7 +58,7 @@ _SOON: dict[str, Any] = {"cuts": (plane.EARLY_SHARE,), "unattained": plane.CLEAR
 CLEARANCE = Measure(plane.clearance, unit="m", terms=MeasureTerms(plane.distances, **_SOON), collisions_only=True)
 """Distance to the nearest vehicle. A collision belongs to the vehicle that was hit, off the road to the nearest."""
 _PAIRS = MeasureTerms(partial(plane.distances, which="all"), plane.find_nearest_pair, plane.name_pairs, **_SOON)
-PAIR_CLEARANCE = Measure(plane.pair_clearance, unit="m", terms=_PAIRS, collisions_only=True)
+PAIR_CLEARANCE = Measure(partial(plane.clearance, which="all"), unit="m", terms=_PAIRS, collisions_only=True)
 """Distance of the two vehicles that are nearest to each other, the ego or not."""
 _BEAMS = MeasureTerms(line.lidar_ttc_terms, None, line.name_lidar_terms, (line.AT_START,), line.TTC_MAX)
 _BRAKING, _SUM, _MARGIN = -line.DECELERATION_MAX, -ADDED_MAX, -plane.MARGIN_MAX
@@ -158,6 +158,9 @@ class Combined(EpisodeMeasure):
         return f if self.collision is None else torch.where(state[0], self.collision, f)
 
 
+_LEAST = partial(torch.amin, dim=0)
+
+
 def minimum(*measures: Any) -> Combined:
     """Return the most dangerous of several measures: the least of their f.
 
@@ -173,7 +176,7 @@ def minimum(*measures: Any) -> Combined:
         >>> problem.evaluate([[20.0, 10.0, 30.0]]).round(2).tolist()  # of 2.98 s and 1.49 s
         [1.49]
     """
-    return Combined(_find_all(measures), _least)
+    return Combined(_find_all(measures), _LEAST)
 
 
 def weighted(*terms: tuple[Any, float]) -> Combined:
@@ -217,17 +220,12 @@ def with_collision(measure: Any, value: float = COLLISION) -> Combined:
         >>> problem.evaluate([[20.0, 10.0, 5.0], [20.0, 20.0, 40.0]]).round(1).tolist()
         [-5.0, 40.0]
     """
-    return Combined(_find_all([measure]), _least, float(value))
+    return Combined(_find_all([measure]), _LEAST, float(value))
 
 
 def _add_weighted(weights: tuple[float, ...], f: Tensor) -> Tensor:
     """Return the weighted sum over the first axis: (K, B) to (B,)."""
     return (f * constant(weights, f)[:, None]).sum(0)
-
-
-def _least(f: Tensor) -> Tensor:
-    """Return the least over the first axis: (K, B) to (B,)."""
-    return f.amin(0)
 
 
 def _find_all(measures: Any) -> tuple[EpisodeMeasure, ...]:

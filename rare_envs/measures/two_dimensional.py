@@ -57,14 +57,9 @@ def distances(moment: Moment, which: Which = "ego") -> Tensor:
     return box_distance(met.axes, met.other_heading - met.heading).clamp(GAP_MIN, CLEARANCE_MAX)
 
 
-def clearance(moment: Moment) -> Tensor:
+def clearance(moment: Moment, which: Which = "ego") -> Tensor:
     """Return the exact distance between the ego's body and the nearest other [m], in [0.01, 1000], shape (B,)."""
-    return least(distances(moment), CLEARANCE_MAX)
-
-
-def pair_clearance(moment: Moment) -> Tensor:
-    """Return the distance of the two vehicles that are nearest to each other [m], the ego or not, shape (B,)."""
-    return distances(moment, "all").amin(1)
+    return least(distances(moment, which), CLEARANCE_MAX)
 
 
 def margin_terms(moment: Moment) -> Tensor:

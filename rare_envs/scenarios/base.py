@@ -25,8 +25,6 @@ from rare_envs.traffic.state import Motion, State, point_mass
 
 Others = Motion
 """Vehicles 1 to N - 1 after a tick; shapes (B, N - 1)."""
-DATA = resources.files("rare_envs") / "data"
-"""Files that come with the package."""
 SPEED_RANGE = ("m/s", 0.0, 45.0)
 """Unit and range of a speed as a parameter. Nobody drives backwards, and 45 m/s (162 km/h) is above what congested
 US 101 (at most 27 m/s in the events) and free-flow traffic reach."""
@@ -118,6 +116,12 @@ class Scenario:
     def column_parameters(self) -> list[Parameter]:
         """The parameter of each column of x."""
         return [parameter for parameter in self.parameters for _ in range(parameter.size)]
+
+
+def base_files(prefix: str, *names: str) -> dict[str, Any]:
+    """Return the base distributions of these names that come with the package, as files."""
+    folder = resources.files("rare_envs") / "data"
+    return {name: folder / f"{prefix}_{name.replace('-', '_')}.json" for name in names}
 
 
 def columns(*values: Tensor) -> Tensor:

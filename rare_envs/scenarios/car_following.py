@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, keep_lane
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, base_files, columns, keep_lane
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -41,15 +41,7 @@ CAR_FOLLOWING = Scenario(
         Parameter("lead_speed", *SPEED_RANGE, "speed of the lead, which keeps it"),
         Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
     ),
-    bases={
-        "us101": DATA / "car_following_us101.json",
-        "us101-gap": DATA / "car_following_us101_gap.json",
-        "us101-log-gap": DATA / "car_following_us101_log_gap.json",
-        "i80": DATA / "car_following_i80.json",
-        "i80-all-pairs": DATA / "car_following_i80_all_pairs.json",
-        "i24": DATA / "car_following_i24.json",
-        "highway": DATA / "car_following_highway.json",
-    },
+    bases=base_files("car_following", "us101", "us101-gap", "us101-log-gap", "i80", "i80-all-pairs", "i24", "highway"),
     initial=initial,
     others=others,
     driven=keep_lane,

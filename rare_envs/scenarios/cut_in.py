@@ -11,7 +11,7 @@ from torch import Tensor
 from rare_envs.control.idm import IDM
 from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, base_files, columns
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
@@ -91,8 +91,6 @@ def _advance(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Othe
     return Others(*table.view(4, 2, len(x)).mT.unbind(0))
 
 
-TIMED_BASES = ("us101", "us101-closing", "i80", "i80-closing", "highway")
-"""Names of the bases of `CutIn-v1`, the default first."""
 CUT_IN = Scenario(
     name="cut_in",
     road=straight(2),
@@ -109,14 +107,7 @@ CUT_IN = Scenario(
         Parameter("lead_gap", "m", 1.0, 150.0, "initial gap from cutter to lead along the road"),
         Parameter("lateral_offset", "m", 2.2, 5.0, "initial distance of the centres across"),
     ),
-    bases={
-        "us101": DATA / "cut_in_us101.json",
-        "us101-15-offsets": DATA / "cut_in_us101_15_offsets.json",
-        "us101-closing": DATA / "cut_in_us101_closing.json",
-        "i80": DATA / "cut_in_i80.json",
-        "i80-closing": DATA / "cut_in_i80_closing.json",
-        "highway": DATA / "cut_in_highway.json",
-    },
+    bases=base_files("cut_in", "us101", "us101-15-offsets", "us101-closing", "i80", "i80-closing", "highway"),
     initial=initial,
     others=others,
     driven=driven,
@@ -127,6 +118,6 @@ TIMED_CUT_IN = replace(
     # Below 1.5 s a change by a lane of 3.5 m needs more than 9.3 m/s^2 across (6 offset / duration^2), which tyres do
     # not give, and of 390 recorded changes none is shorter than 2.3 s; two over 12 s are left out.
     parameters=(*CUT_IN.parameters, Parameter("duration", "s", 1.5, 12.0, "time of the lane change")),
-    bases={name: DATA / f"cut_in_v1_{name.replace('-', '_')}.json" for name in TIMED_BASES},
+    bases=base_files("cut_in_v1", "us101", "us101-closing", "i80", "i80-closing", "highway"),
 )
 """`CutIn-v1`."""

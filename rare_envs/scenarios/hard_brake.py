@@ -9,24 +9,9 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, Others, Scenario, columns, keep_lane, keep_straight
+from rare_envs.scenarios.base import Others, Scenario, base_files, columns, keep_lane, keep_straight
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
-
-US101 = {
-    "means": [[10.6561, 2.5113, 0.7264]],
-    "covariances": [[[13.7428, 1.1543, 0.1011], [1.1543, 0.2879, -0.0142], [0.1011, -0.0142, 0.1254]]],
-    "weights": [1.0],
-    "coordinates": ["plain", "log", "log"],
-    "provenance": {
-        "kind": "moments of recorded events",
-        "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",
-        "events": "265 brakings by 3 m/s or more; speed at their beginning, gap of the braking vehicle to its own lead "
-        "at that time (nobody's who follows is recorded), strongest deceleration of positions smoothed over 1 s",
-        "licence": "CC BY-SA 3.0, as that of the data",
-    },
-}
-"""Normal speed, logarithms of gap and deceleration."""
 
 
 def initial(x: Tensor) -> State:
@@ -58,7 +43,7 @@ HARD_BRAKE = Scenario(
         Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
         Parameter("deceleration", "m/s^2", 0.5, 10.0, "of the lead, until it stands"),
     ),
-    bases={"us101": DATA / "hard_brake_us101.json", "us101-all-brakings": US101},
+    bases=base_files("hard_brake", "us101", "us101-all-brakings"),
     initial=initial,
     others=others,
     driven=keep_lane,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rare_envs.devices import constant
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, Others, Scenario, drive_points
+from rare_envs.scenarios.base import Others, Scenario, base_files, drive_points
 from rare_envs.traffic.road import i80
 from rare_envs.traffic.state import State
 
@@ -55,7 +55,7 @@ HIGHWAY = Scenario(
         ),
         Parameter("speed", "m/s", 10.0, 20.0, "initial speed", VEHICLE_COUNT),
     ),
-    bases={"okelly2018": DATA / "highway_okelly2018.json"},
+    bases=base_files("highway", "okelly2018"),
     initial=initial,
     others=others,
     driven=driven,

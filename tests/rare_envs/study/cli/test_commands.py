@@ -94,7 +94,7 @@ def test_one_kind_is_explained_alone(cli: Cli) -> None:
 def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     bases = {
         "us101": fitted_entries("hard_brake"),
-        "plain": {**HARD_BRAKE.bases["us101-all-brakings"], "provenance": None},
+        "plain": {**json.loads(HARD_BRAKE.bases["us101-all-brakings"].read_text()), "provenance": None},
     }
     monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
     answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
