@@ -63,11 +63,7 @@ def is_command_line() -> bool:
 
 
 def end_at_signals() -> None:
-    """Let SIGINT, SIGTERM and SIGHUP end the process in one line until `restore_signals`; in a command line alone.
-
-    For imports: Python would print where in them it was, and an exception ends the C++ of torch with an abort. Nothing
-    has begun yet, so nothing is to be tidied up. Signals that are ignored (nohup) stay so.
-    """
+    """Let signals end a command in one line while modules are imported; Python would print where it was."""
     is_worker = "--multiprocessing-fork" in sys.orig_argv  # it imports the modules of its parent, and runs no command
     if is_worker or not is_command_line():
         return
@@ -97,17 +93,7 @@ __version__ = "0.1.0"
 
 @contextlib.contextmanager
 def use_one_thread() -> Iterator[None]:
-    """Keep torch to one thread, and let it have as many as before afterwards; for a block or, as decorator, a function.
-
-    Networks and batches this small lose more time to further threads than they gain, and on one thread sums round alike
-    on every machine. Without torch, there is nothing to keep.
-
-    Example:
-        >>> import torch
-        >>> with use_one_thread():
-        ...     torch.get_num_threads()
-        1
-    """
+    """Keep torch, if it is there, to one thread for a block or, as decorator, a function: sums then round alike."""
     if find_missing_libraries(("torch",)):
         yield
         return

@@ -151,11 +151,7 @@ def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
 
 
 def choose_action(action_space: Any, observation: str) -> str:
-    """Return the kind of actions of an ego for which nobody names it.
-
-    Numbers from 0 to 4 are taken as five accelerations, but for policies with HighwayEnv's kinematics, which may as
-    well have been trained with its meta-actions.
-    """
+    """Return the kind of actions where nobody names it; with HighwayEnv's kinematics 0 to 4 fit two kinds."""
     if takes_indices(action_space) and "kinematics" in observation.split("+"):
         raise ValueError(
             "The ego's actions 0 to 4 fit two kinds: HighwayEnv's meta-actions (action='meta', --action meta; or the "
@@ -210,10 +206,7 @@ RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), "human": Hu
 
 
 def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
-    """Return what an ego of any kind, see `as_driver`, needs of its world, in a scenario with so many vehicles.
-
-    An ego that wraps another one needs what that one needs, and noise columns of its own.
-    """
+    """Return what an ego needs, among so many vehicles; a wrapping one what the inner one needs, and own noise."""
     # The ego may be anybody's object, such as a Stable-Baselines3 model: it may declare these or not.
     ego = find_rule_based(ego)
     if hasattr(ego, "in_world"):

@@ -204,11 +204,7 @@ def find_device_driver(driver: Driver, device: torch.device, before: Driver | No
 
 
 def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
-    """Return the Driver that an ego stands for in a world, which has what `resolve` says it needs; else a ValueError.
-
-    "idm", "human", a `Driver`, an object with `predict`, an ego of worlds, or a function or torch module of
-    observations. `needs` is the answer of `resolve`, if it is known already.
-    """
+    """Return the Driver that an ego of any kind, see `egos.needs`, stands for in a world; else a ValueError."""
     ego = find_rule_based(ego)
     if hasattr(ego, "in_world"):
         driver: Driver = ego.in_world(world)
@@ -231,11 +227,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
 
 
 def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features") -> None:
-    """Refuse an ego that was made for other observations or kinds of actions; one that declares none is accepted.
-
-    Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there. `declared` is the
-    kind of observation that the ego's space tells, for the message.
-    """
+    """Refuse an ego that declares other observations, `declared` for the message, or actions; bounds may differ."""
     observed, acted = (getattr(ego, f"{name}_space", None) for name in ("observation", "action"))  # anybody's object
     if observed is not None and find_frame_stacking(expected, observed) is None:
         which = "another observation" if declared == "features" else f"observation={declared!r}"

@@ -137,12 +137,7 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
 
 
 def describe_missing_normalisation(policy: Any, given: spaces.Space[Any]) -> str:
-    """Return why the statistics of a policy's observations of a space seem to be missing; "" if nothing says so.
-
-    A saved ego says it by `find_missing_statistics`. A Stable-Baselines3 model in memory brings those of
-    `VecNormalize`; those of Gymnasium's `NormalizeObservation` stay in its training environments, and the bounds of its
-    observations tell. Of any other object nothing is said.
-    """
+    """Return why statistics of a policy's observations of a space seem to be missing; "" if nothing says so."""
     if hasattr(policy, "find_missing_statistics"):
         return str(policy.find_missing_statistics(given))
     if getattr(policy, "get_vec_normalize_env", lambda: policy)() is not None:

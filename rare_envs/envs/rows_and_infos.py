@@ -95,10 +95,7 @@ def take_step(
 
 
 def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
-    """Return tensors, tuples of such or what has `replace_rows` of B scenarios with the rows (R,) replaced.
-
-    The rest, as the road, is common to all.
-    """
+    """Return nested tuples of tensors of B scenarios with rows (R,) replaced; the rest, as the road, is common."""
 
     def merge(old: Any, new: Any) -> Any:
         if not isinstance(old, Tensor):

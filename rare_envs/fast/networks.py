@@ -11,19 +11,8 @@ from numpy.typing import NDArray
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.egos.dense_policies import DensePolicy
-from rare_envs.fast.equations import (
-    BODY_LENGTH,
-    ONE,
-    ZERO,
-    at_least,
-    at_most,
-    clip,
-    compiled,
-    compiled_fused,
-    cosine,
-    sine,
-    single,
-)
+from rare_envs.fast import equations as eq
+from rare_envs.fast.equations import compiled, compiled_fused, single
 from rare_envs.fast.rows import UNKNOWN, Rows, SingleArray
 from rare_envs.simulation.observation import CLIP, EGO_SCALES, OTHER_SCALES
 
@@ -111,7 +100,7 @@ def pad(width: int) -> int:
 @compiled
 def decide_by_policy(rows: Rows, policy: PolicyNumbers, values: SingleArray, spare: SingleArray) -> None:
     """Decide for at most `LANES` egos, f of failing ones is `UNKNOWN`; writes over two (widest layer, `LANES`)."""
-    values[4 * len(rows.x) - 1 : policy.widths[0]] = ZERO
+    values[4 * len(rows.x) - 1 : policy.widths[0]] = eq.ZERO
     observe(rows, values)
     normalise(policy, values, rows.size)
     apply_layers(policy, values, spare)
@@ -119,7 +108,7 @@ def decide_by_policy(rows: Rows, policy: PolicyNumbers, values: SingleArray, spa
     for row in range(rows.size):
         acceleration, steering = decode(outputs[:, row], policy)
         known = acceleration == acceleration
-        rows.acceleration[row], rows.steering[row] = (acceleration, steering) if known else (ZERO, ZERO)
+        rows.acceleration[row], rows.steering[row] = (acceleration, steering) if known else (eq.ZERO, eq.ZERO)
         rows.f[row] = rows.f[row] if known else UNKNOWN
 
 
@@ -133,15 +122,15 @@ def observe(rows: Rows, values: SingleArray) -> None:
     for other in range(1, len(rows.x)):
         place = 4 * other - 1
         for row in range(rows.size):
-            along, other_heading = speed[row] * cosine(heading[row]), rows.heading[other, row]
+            along, other_heading = speed[row] * eq.cosine(heading[row]), rows.heading[other, row]
             other_speed = rows.speed[other, row]
-            values[place, row] = (rows.x[other, row] - x[row] - BODY_LENGTH) / _GAP
-            values[place + 1, row] = (other_speed * cosine(other_heading) - along) / _RELATIVE_SPEED
+            values[place, row] = (rows.x[other, row] - x[row] - eq.BODY_LENGTH) / _GAP
+            values[place + 1, row] = (other_speed * eq.cosine(other_heading) - along) / _RELATIVE_SPEED
             values[place + 2, row] = (rows.y[other, row] - y[row]) / _RELATIVE_Y
-            values[place + 3, row] = other_speed * sine(other_heading) / _LATERAL_SPEED
+            values[place + 3, row] = other_speed * eq.sine(other_heading) / _LATERAL_SPEED
     for feature in range(4 * len(rows.x) - 1):
         for row in range(rows.size):
-            values[feature, row] = clip(values[feature, row], -_BOUND, _BOUND)
+            values[feature, row] = eq.clip(values[feature, row], -_BOUND, _BOUND)
 
 
 @compiled
@@ -150,7 +139,7 @@ def normalise(policy: PolicyNumbers, values: SingleArray, size: int) -> None:
     for feature in range(len(policy.mean)):
         for row in range(size):
             normal = (np.float64(values[feature, row]) - policy.mean[feature]) / policy.deviation[feature]
-            values[feature, row] = np.float32(at_most(at_least(normal, -policy.furthest), policy.furthest))
+            values[feature, row] = np.float32(eq.at_most(eq.at_least(normal, -policy.furthest), policy.furthest))
 
 
 @compiled
@@ -201,7 +190,7 @@ def activate(values: SingleArray, bounded: bool) -> None:
     """Write hyperbolic tangents of values (n,) over them, to 3e-7 of their size, or the larger of 0 and the value."""
     if not bounded:
         for i in range(len(values)):
-            values[i] = ZERO if values[i] < ZERO else values[i]
+            values[i] = eq.ZERO if values[i] < eq.ZERO else values[i]
         return
     for i in range(len(values)):
         x = min(max(values[i], -_LIMIT), _LIMIT) if values[i] == values[i] else values[i]
@@ -230,8 +219,8 @@ def decode(outputs: SingleArray, policy: PolicyNumbers) -> tuple[float, float]:
 @compiled
 def decode_one(outputs: SingleArray, policy: PolicyNumbers, number: int) -> float:
     """Return an output in [-1, 1]: clipped, and rescaled as `rare_envs.egos.wrappers.WrappedPolicy` does."""
-    value = clip(outputs[number], policy.clip[0, number], policy.clip[1, number])
+    value = eq.clip(outputs[number], policy.clip[0, number], policy.clip[1, number])
     if policy.rescales:
         low, high = policy.rescale[0, number], policy.rescale[1, number]
         value = _single((2.0 * np.float64(value) - low - high) / (high - low))
-    return clip(value, -ONE, ONE)
+    return eq.clip(value, -eq.ONE, eq.ONE)

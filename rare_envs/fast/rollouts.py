@@ -11,21 +11,9 @@ from numpy.typing import NDArray
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.control.idm import IDM
 from rare_envs.egos.dense_policies import DensePolicy
+from rare_envs.fast import equations as eq
 from rare_envs.fast import rows as fast_rows
-from rare_envs.fast.equations import (
-    ONE,
-    TWO,
-    ZERO,
-    IDMNumbers,
-    RoadNumbers,
-    at_least,
-    boxes_overlap,
-    centre_of,
-    clip,
-    compiled,
-    off_road,
-    single,
-)
+from rare_envs.fast.equations import IDMNumbers, RoadNumbers, compiled, single
 from rare_envs.fast.networks import LANES, PolicyNumbers, decide_by_policy, observe
 from rare_envs.fast.rows import (
     HIT,
@@ -222,7 +210,7 @@ def others_touch(rows: Rows) -> bool:
         for other in range(one + 1, len(x)):
             for row in range(rows.size):
                 dx, dy = x[other, row] - x[one, row], y[other, row] - y[one, row]
-                if boxes_overlap(dx, dy, heading[one, row], heading[other, row]):
+                if eq.boxes_overlap(dx, dy, heading[one, row], heading[other, row]):
                     return True
     return False
 
@@ -231,18 +219,18 @@ def others_touch(rows: Rows) -> bool:
 def write_reward(terms: SingleArray, rows: Rows, row: int, road: RoadNumbers) -> None:
     """Write the terms of the reward (6,): `rare_envs.simulation.decision.reward_terms`."""
     y, speed = rows.y[0, row], rows.speed[0, row]
-    offset = y - centre_of(y, road)
+    offset = y - eq.centre_of(y, road)
     offset -= np.rint(offset / road.width) * road.width
     effort, turn = rows.acceleration[row] / _ACCELERATION, rows.steering[row] / _STEERING
-    share = offset / (road.width / TWO)
-    gap = at_least(rows.gap[row], ZERO)
-    time = gap / at_least(rows.closing[row], _LEAST_CLOSING)
-    terms[0] = clip(speed * math.cos(rows.heading[0, row]) / _TARGET_SPEED, ZERO, ONE)
+    share = offset / (road.width / eq.TWO)
+    gap = eq.at_least(rows.gap[row], eq.ZERO)
+    time = gap / eq.at_least(rows.closing[row], _LEAST_CLOSING)
+    terms[0] = eq.clip(speed * math.cos(rows.heading[0, row]) / _TARGET_SPEED, eq.ZERO, eq.ONE)
     terms[1] = _EFFORT * (effort * effort + turn * turn)
     terms[2] = _LANE * (share * share)
-    terms[3] = -at_least(ONE - time / _COMFORT, ZERO)
-    terms[4] = _HEADWAY * at_least(ONE - gap / (_STANDING_GAP + _TIME_GAP * speed), ZERO)
-    terms[5] = _COST if rows.f[row] == HIT else ZERO
+    terms[3] = -eq.at_least(eq.ONE - time / _COMFORT, eq.ZERO)
+    terms[4] = _HEADWAY * eq.at_least(eq.ONE - gap / (_STANDING_GAP + _TIME_GAP * speed), eq.ZERO)
+    terms[5] = _COST if rows.f[row] == HIT else eq.ZERO
 
 
 # Crashes: who hit whom and how, on a straight road; twins of the functions of `rare_envs.traffic.crash` that are named.
@@ -302,16 +290,16 @@ def write_crash(
 ) -> None:
     """Write the crash of vehicles from `first` to before `last` with those behind them, (4, N): `crash.crash_of`."""
     x, y, heading = new[0], new[1], new[2]
-    earliest, pair, contact = _NEVER, (-1, -1), Contact(_NEVER, 0, ZERO, ZERO, ZERO, ZERO)
+    earliest, pair, contact = _NEVER, (-1, -1), Contact(_NEVER, 0, eq.ZERO, eq.ZERO, eq.ZERO, eq.ZERO)
     for one in range(first, last):
         for other in range(one + 1, new.shape[1]):
-            if boxes_overlap(x[other] - x[one], y[other] - y[one], heading[one], heading[other]):
+            if eq.boxes_overlap(x[other] - x[one], y[other] - y[one], heading[one], heading[other]):
                 latest = find_contact(old, new, one, other, dt)
                 if latest.since < earliest:
                     earliest, pair, contact = latest.since, (one, other), latest
     if pair[0] >= 0:
         _write_contact(contact, old, new, pair, dt, found, row)
-    elif first == 0 and off_road(y[0], road):
+    elif first == 0 and eq.off_road(y[0], road):
         _write_edge(old, new, dt, found, row)
 
 
@@ -323,9 +311,9 @@ def find_contact(old: SingleArray, new: SingleArray, one: int, other: int, dt: f
     dvy = (new[1, other] - old[1, other]) / dt - (new[1, one] - old[1, one]) / dt
     turn = new[2, other] - new[2, one]
     turn_cos, turn_sin = abs(math.cos(turn)), abs(math.sin(turn))
-    since, least, ahead = -_NEVER, -_NEVER, ZERO
-    axis, closing = 0, ZERO  # of the last to overlap
-    shallow, shallow_closing = 0, ZERO  # of the one along which they overlap least
+    since, least, ahead = -_NEVER, -_NEVER, eq.ZERO
+    axis, closing = 0, eq.ZERO  # of the last to overlap
+    shallow, shallow_closing = 0, eq.ZERO  # of the one along which they overlap least
     for number in range(4):
         course = new[2, one] if number < 2 else new[2, other]
         cos, sin = math.cos(course), math.sin(course)
@@ -336,7 +324,7 @@ def find_contact(old: SingleArray, new: SingleArray, one: int, other: int, dt: f
             offset, rate = dy * cos - dx * sin, dvy * cos - dvx * sin
             reach = _HALF_WIDTH + _HALF_LENGTH * turn_sin + _HALF_WIDTH * turn_cos
         gap = abs(offset) - reach
-        enter = -offset / rate - reach / abs(rate) if rate != ZERO else (-_NEVER if gap < ZERO else _NEVER)
+        enter = -offset / rate - reach / abs(rate) if rate != eq.ZERO else (-_NEVER if gap < eq.ZERO else _NEVER)
         approach = -rate * np.sign(offset)
         if number == 0:
             ahead = offset
@@ -346,7 +334,7 @@ def find_contact(old: SingleArray, new: SingleArray, one: int, other: int, dt: f
             least, shallow, shallow_closing = gap, number, approach
     if math.isinf(since):  # nothing moves
         since, axis, closing = _ALWAYS, shallow, shallow_closing
-    return Contact(since, axis, closing if closing > ZERO else ZERO, np.sqrt(dvx * dvx + dvy * dvy), ahead, turn)
+    return Contact(since, axis, closing if closing > eq.ZERO else eq.ZERO, np.sqrt(dvx * dvx + dvy * dvy), ahead, turn)
 
 
 @compiled
@@ -361,7 +349,7 @@ def _write_contact(
     found.kind[row] = kind
     found.vehicles[row, 0], found.vehicles[row, 1] = (one, other) if own >= its else (other, one)
     found.impact_speed[row], found.closing_speed[row] = contact.impact, contact.closing
-    change = _PART / TWO * contact.closing
+    change = _PART / eq.TWO * contact.closing
     found.delta_v[row] = change
     found.injury_risk[row, 0] = risk_of(change, _ALL if kind == _SIDE else _FRONTAL)
     found.injury_risk[row, 1] = risk_of(change, _ALL if kind == _SIDE else _REAR)
@@ -370,11 +358,11 @@ def _write_contact(
 @compiled
 def _kind(contact: Contact) -> int:
     """Return the kind of a crash: `rare_envs.traffic.crash._kind`."""
-    angle = contact.turn if contact.axis >= 2 else ZERO
+    angle = contact.turn if contact.axis >= 2 else eq.ZERO
     lengthwise = (abs(math.cos(angle)) >= abs(math.sin(angle))) == (contact.axis % 2 == 0)
     if not lengthwise:
         return _SIDE
-    return _REAR_END if contact.ahead > ZERO else _REAR_ENDED
+    return _REAR_END if contact.ahead > eq.ZERO else _REAR_ENDED
 
 
 @compiled
@@ -384,11 +372,11 @@ def _write_edge(old: SingleArray, new: SingleArray, dt: float, found: crash.Cras
     change = _PART * across
     found.kind[row], found.vehicles[row, 0], found.vehicles[row, 1] = _ROAD_EDGE, 0, -1
     found.impact_speed[row], found.closing_speed[row] = new[3, 0], across
-    found.delta_v[row, 0], found.delta_v[row, 1] = change, ZERO
-    found.injury_risk[row, 0], found.injury_risk[row, 1] = risk_of(change, _ALL), ZERO
+    found.delta_v[row, 0], found.delta_v[row, 1] = change, eq.ZERO
+    found.injury_risk[row, 0], found.injury_risk[row, 1] = risk_of(change, _ALL), eq.ZERO
 
 
 @compiled
 def risk_of(delta_v: float, curve: tuple[float, ...]) -> float:
     """Return the probability of a serious injury: `rare_envs.traffic.crash.injury_risk`."""
-    return ONE / (ONE + math.exp(-(curve[0] + curve[1] * delta_v)))
+    return eq.ONE / (eq.ONE + math.exp(-(curve[0] + curve[1] * delta_v)))

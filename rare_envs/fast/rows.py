@@ -11,35 +11,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.fast.equations import (
-    BODY_LENGTH,
-    FOUR,
-    ONE,
-    SIX,
-    THREE,
-    TWO,
-    ZERO,
-    IDMNumbers,
-    RoadNumbers,
-    are_near,
-    at_least,
-    at_most,
-    bicycle,
-    boxes_overlap,
-    centre_of,
-    clip,
-    compiled,
-    cosine,
-    fourth_power,
-    idm_acceleration,
-    inlined,
-    keep_straight,
-    off_road,
-    single,
-    steer_to_line,
-    time_to_edge,
-    time_to_lead,
-)
+from rare_envs.fast import equations as eq
+from rare_envs.fast.equations import IDMNumbers, RoadNumbers, compiled, inlined, single
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
 
@@ -126,7 +99,7 @@ def move_others(rows: Rows, script: ScriptNumbers) -> None:
         cut_in(rows, script.cutter_idm, dt)
     elif script.number == BRAKING:
         for row in range(rows.size):
-            x[row], speed[row] = keep_straight(x[row], speed[row], -rows.theta[0, row], dt)
+            x[row], speed[row] = eq.keep_straight(x[row], speed[row], -rows.theta[0, row], dt)
     else:
         for row in range(rows.size):
             x[row] += speed[row] * dt
@@ -141,26 +114,26 @@ def cut_in(rows: Rows, idm: IDMNumbers, dt: float) -> None:
     start, length, offset, desired_speed = rows.theta[0], rows.theta[1], rows.theta[2], rows.theta[3]
     bends = False
     for row in range(rows.size):
-        gap, closing = lead_x[row] - x[row] - BODY_LENGTH, speed[row] - lead_speed[row] * cos[row]
+        gap, closing = lead_x[row] - x[row] - eq.BODY_LENGTH, speed[row] - lead_speed[row] * cos[row]
         ratio = speed[row] / desired_speed[row]
-        acceleration = idm_acceleration(idm, speed[row], gap, closing, ratio, fourth_power(ratio))
+        acceleration = eq.idm_acceleration(idm, speed[row], gap, closing, ratio, eq.fourth_power(ratio))
         x[row] = x[row] + speed[row] * cos[row] * dt
-        speed[row] = at_least(speed[row] + acceleration * dt, ZERO)
+        speed[row] = eq.at_least(speed[row] + acceleration * dt, eq.ZERO)
         lead_x[row] += lead_speed[row] * dt
-        lead_y[row], lead_heading[row], lead_cos[row] = ZERO, ZERO, ONE
+        lead_y[row], lead_heading[row], lead_cos[row] = eq.ZERO, eq.ZERO, eq.ONE
         y[row], slope[row] = bezier(x[row] - start[row], length[row], offset[row])
-        bends |= (slope[row] != ZERO) | (heading[row] != ZERO)
+        bends |= (slope[row] != eq.ZERO) | (heading[row] != eq.ZERO)
     if bends:
         for row in range(rows.size):
-            heading[row] = slope[row] if slope[row] == ZERO else math.atan(slope[row])
-            cos[row] = cosine(heading[row])
+            heading[row] = slope[row] if slope[row] == eq.ZERO else math.atan(slope[row])
+            cos[row] = eq.cosine(heading[row])
 
 
 @compiled
 def bezier(progress: float, length: float, offset: float) -> tuple[float, float]:
     """Return y and slope of the path: `rare_envs.scenarios.cut_in.bezier`."""
-    t = clip(progress / length, ZERO, ONE)
-    return offset * (ONE + t * t * (TWO * t - THREE)), offset * (SIX * t * (t - ONE)) / length
+    t = eq.clip(progress / length, eq.ZERO, eq.ONE)
+    return offset * (eq.ONE + t * t * (eq.TWO * t - eq.THREE)), offset * (eq.SIX * t * (t - eq.ONE)) / length
 
 
 @compiled
@@ -170,7 +143,7 @@ def begin(rows: Rows, f: SingleArray) -> None:
         rows.f[row] = f[row]
     for vehicle in range(len(rows.x)):
         for row in range(rows.size):
-            rows.cosine[vehicle, row] = cosine(rows.heading[vehicle, row])
+            rows.cosine[vehicle, row] = eq.cosine(rows.heading[vehicle, row])
 
 
 @inlined
@@ -186,18 +159,20 @@ def tick(rows: Rows, turns: bool, script: ScriptNumbers) -> bool:
 def decide_by_idm(rows: Rows, turns: bool, idm: IDMNumbers) -> None:
     """Decide for the egos: `rare_envs.control.idm.IDM.act`."""
     speed, gap, closing, acceleration = rows.speed[0], rows.gap, rows.closing, rows.acceleration
-    if idm.exponent == FOUR:
+    if idm.exponent == eq.FOUR:
         for row in range(rows.size):
             ratio = speed[row] / idm.desired_speed
-            acceleration[row] = idm_acceleration(idm, speed[row], gap[row], closing[row], ratio, fourth_power(ratio))
+            acceleration[row] = eq.idm_acceleration(
+                idm, speed[row], gap[row], closing[row], ratio, eq.fourth_power(ratio)
+            )
     else:
         for row in range(rows.size):
             ratio = speed[row] / idm.desired_speed
             free = ratio**idm.exponent
-            acceleration[row] = idm_acceleration(idm, speed[row], gap[row], closing[row], ratio, free)
+            acceleration[row] = eq.idm_acceleration(idm, speed[row], gap[row], closing[row], ratio, free)
     if turns:
         for row in range(rows.size):
-            rows.steering[row] = steer_to_line(rows.y[0, row] - rows.lane[row], rows.heading[0, row], speed[row])
+            rows.steering[row] = eq.steer_to_line(rows.y[0, row] - rows.lane[row], rows.heading[0, row], speed[row])
 
 
 @inlined
@@ -206,12 +181,12 @@ def move_egos(rows: Rows, turns: bool, dt: float) -> None:
     x, y, heading, speed, acceleration = rows.x[0], rows.y[0], rows.heading[0], rows.speed[0], rows.acceleration
     if turns:
         for row in range(rows.size):
-            x[row], y[row], heading[row], speed[row] = bicycle(
+            x[row], y[row], heading[row], speed[row] = eq.bicycle(
                 x[row], y[row], heading[row], speed[row], acceleration[row], rows.steering[row], dt
             )
         return
     for row in range(rows.size):
-        x[row], speed[row] = keep_straight(x[row], speed[row], acceleration[row], dt)
+        x[row], speed[row] = eq.keep_straight(x[row], speed[row], acceleration[row], dt)
 
 
 @inlined
@@ -222,15 +197,15 @@ def mark_hits(rows: Rows, turns: bool, road: RoadNumbers) -> None:
         other_x, other_y, other_heading = rows.x[other], rows.y[other], rows.heading[other]
         near = False
         for row in range(rows.size):
-            near |= are_near(other_x[row] - x[row], other_y[row] - y[row])
+            near |= eq.are_near(other_x[row] - x[row], other_y[row] - y[row])
         if near:
             for row in range(rows.size):
                 dx, dy = other_x[row] - x[row], other_y[row] - y[row]
-                if f[row] > HIT and boxes_overlap(dx, dy, heading[row], other_heading[row]):
+                if f[row] > HIT and eq.boxes_overlap(dx, dy, heading[row], other_heading[row]):
                     f[row] = HIT
     if turns:
         for row in range(rows.size):
-            f[row] = HIT if f[row] > HIT and off_road(y[row], road) else f[row]
+            f[row] = HIT if f[row] > HIT and eq.off_road(y[row], road) else f[row]
 
 
 @inlined
@@ -248,19 +223,19 @@ def look(rows: Rows, turns: bool, road: RoadNumbers) -> bool:
         if off_line:
             cosines = rows.spare[0]
             for row in range(rows.size):
-                cosines[row] = cosine(rows.heading[other, row] - rows.heading[0, row])
+                cosines[row] = eq.cosine(rows.heading[other, row] - rows.heading[0, row])
         for row in range(rows.size):
             ahead = other_x[row] - x[row]
-            nearer = (ahead >= ZERO) & (abs(other_y[row] - lane[row]) <= road.reach) & (ahead <= gap[row])
+            nearer = (ahead >= eq.ZERO) & (abs(other_y[row] - lane[row]) <= road.reach) & (ahead <= gap[row])
             gap[row] = ahead if nearer else gap[row]
             closing[row] = other_speed[row] * cosines[row] if nearer else closing[row]
     for row in range(rows.size):
-        gap[row], closing[row] = gap[row] - BODY_LENGTH, speed[row] - closing[row]
-        time = at_most(time_to_lead(gap[row], closing[row]), _LARGEST)
-        f[row] = at_most(time, f[row])
+        gap[row], closing[row] = gap[row] - eq.BODY_LENGTH, speed[row] - closing[row]
+        time = eq.at_most(eq.time_to_lead(gap[row], closing[row]), _LARGEST)
+        f[row] = eq.at_most(time, f[row])
     if off_line:
         for row in range(rows.size):
-            f[row] = at_most(time_to_edge(rows.y[0, row], rows.heading[0, row], speed[row], road), f[row])
+            f[row] = eq.at_most(eq.time_to_edge(rows.y[0, row], rows.heading[0, row], speed[row], road), f[row])
     return off_line
 
 
@@ -269,6 +244,6 @@ def find_lanes(rows: Rows, road: RoadNumbers) -> bool:
     """Find the egos' lanes; return whether any is off its line."""
     y, heading, lane, off_line = rows.y[0], rows.heading[0], rows.lane, False
     for row in range(rows.size):
-        lane[row] = centre_of(y[row], road)
-        off_line |= (heading[row] != ZERO) | (y[row] != lane[row])
+        lane[row] = eq.centre_of(y[row], road)
+        off_line |= (heading[row] != eq.ZERO) | (y[row] != lane[row])
     return off_line

@@ -110,11 +110,7 @@ def record(world: World, driver: Driver, x: Tensor, size: int) -> Recording:
 
 
 def is_recordable(world: World, driver: Driver) -> bool:
-    """Return whether a rollout may be recorded once and played with other x.
-
-    What a recording does is fixed, as are the numbers in it. So it is for drivers whose own class says that they never
-    change (`says_recordable`), for scenarios and measures of this package, not for what a user wrote.
-    """
+    """Return whether nothing about a rollout but x can change: as drivers' classes say, for nothing of a user's."""
     drivers = (driver,) if world.background is None else (driver, world.background)
     scripts = (world.scenario.initial, world.scenario.others, world.scenario.driven)
     own = (script is None or str(getattr(script, "__module__", "")).startswith("rare_envs.") for script in scripts)

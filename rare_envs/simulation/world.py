@@ -462,10 +462,7 @@ class Driver(Protocol):
 
 
 def noise_columns(driver: Driver) -> int:
-    """Return how many columns of x are a driver's noise, the last ones: its attribute `noise_columns`, if it has one.
-
-    A driver with such noise has `with_draws`, which takes standard normal draws (B, columns).
-    """
+    """Return how many last columns of x are a driver's noise, which `with_draws` takes as standard normal draws."""
     return int(getattr(driver, "noise_columns", 0))  # anybody's object
 
 
