@@ -43,10 +43,7 @@ def read_checkpoint(path: Path, entries: Sequence[str], device: torch.device | s
 
 
 def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> None:
-    """Write a checkpoint of a model in a `training.sb3_vec_env`, at the beginning of a rollout.
-
-    The arguments, JSON-ready, are those of the training; a resumed one has to have the same.
-    """
+    """Write a checkpoint of a model in a `training.sb3_vec_env` at a rollout's beginning, with JSON-ready arguments."""
     monitor = model.get_env()
     names, variables = model._get_torch_save_params()
     state = {

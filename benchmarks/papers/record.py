@@ -111,17 +111,8 @@ def make_record(
 ) -> Entry:
     """Return a record as plain values for JSON.
 
-    Args:
-        title: Of the page.
-        source: The paper: authors, title, place, year.
-        command: As typed.
-        settings: Scale, seeds, replications and whatever else the numbers depend on.
-        tables: The paper's tables beside ours.
-        figures: Data of the figures by their names, with `caption` and `paper`: what the figure shows, and what the
-            printed one shows.
-        findings: The paper's statements, tested.
-        notes: What holds for all of it, in sentences.
-        runs: The single runs.
+    The settings are whatever the numbers depend on; figures have their data by names, with `caption` and `paper`: what
+    they show, and what the printed ones show; notes hold for all of it; the runs are the single ones.
     """
     libraries = {name: _find_version(name) for name in ("torch", "numba", "gymnasium")}
     made = about(rare_envs=rare_envs.__version__, **libraries, **settings)
@@ -148,10 +139,7 @@ def write_record(out: Path, record: Mapping[str, Any], figures: Drawings) -> Non
 
 
 def check_folder(out: Path, study: Mapping[str, Any]) -> None:
-    """Raise BadInput if a folder, which need not exist, has runs of another paper, seed, scale or ego.
-
-    `study` is what the runs are to be of, as the first line of each file of runs has it.
-    """
+    """Raise BadInput if a folder, which need not exist, has runs of another study, as their first lines say."""
     for file in sorted(out.glob("*.jsonl")):
         held = _read_study(file)
         if held is not None and held != study:

@@ -58,11 +58,7 @@ def read_replications(record: dict[str, Any]) -> list[Run]:
 
 
 def renew_tian(record: dict[str, Any], folder: Path, methods: Sequence[str] = ()) -> dict[str, Any]:
-    """Return a record with rows of further methods made anew.
-
-    Raises:
-        ValueError: A method is none of them: its traces are in the figures, which only a whole run draws.
-    """
+    """Return a record with rows of further methods made anew; others take a whole run, as figures have traces."""
     for name in methods:
         if name not in FURTHER:
             raise ValueError(f"Expected methods of {', '.join(FURTHER)}, got {name!r}: run the whole reproduction.")

@@ -106,10 +106,7 @@ def read_header(path: Path) -> list[str]:
 
 
 def read_table(path: Path, columns: ColumnMap, leave_out_empty: bool = False) -> Rows:
-    """Return columns of a CSV file with a header, numbers in the units of the table, or a ValueError on what is wrong.
-
-    Rows in which a number is not given are left out on request.
-    """
+    """Return columns of a CSV file in the units of the table, on request without rows in which a number is missing."""
     header = read_header(path)
     known = {name.lower(): f"c{i}" for i, name in enumerate(header)}
     found = {name: [known[also.lower()] for also in c.names if also.lower() in known] for name, c in columns.items()}
@@ -151,10 +148,7 @@ def _read_csv(path: Path, size: int, columns: ColumnMap) -> pa.Table:
 
 
 def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None, size: int = 18) -> Rows:
-    """Return columns, by their places, of a matrix (rows, size), or of text that holds one without a header.
-
-    Text is separated by blanks or commas. A ValueError says what is wrong with it.
-    """
+    """Return columns, by their places, of a matrix (rows, size), or of text that holds one."""
     if matrix is None:
         try:
             matrix = np.loadtxt(path, ndmin=2, delimiter="," if len(read_header(path)) > 1 else None)
@@ -253,8 +247,8 @@ def check_tracks(
 ) -> None:
     """Raise a ValueError if a row is given twice, a frame is missing, or positions and speeds are impossible or differ.
 
-    Vehicle, frame of the file, position along the road [m] and recorded speed [m/s] have shape (rows,); frames are dt
-    apart [s]. With gaps = "cut" a vehicle may be missing for some frames.
+    Vehicle, frame, position along the road [m] and speed [m/s] have shape (rows,); frames are dt apart [s]. With gaps =
+    "cut" a vehicle may be missing for some frames.
     """
     rows.refuse(
         (speed < 0.0) | (speed > FASTEST_SPEED),

@@ -230,10 +230,9 @@ def time_around_peak(speed: FloatArray, time: FloatArray) -> float:
 
 
 def time_between_spans(start: NDArray[Any], end: NDArray[Any]) -> FloatArray:
-    """Return the time above `LATERAL_SPEED` [s] of changes between slow spans, from their start and end frames (n,).
+    """Return the time above `LATERAL_SPEED` [s] between the start and end frames (n,) of the slow spans around changes.
 
-    The last slow span before a change ends at its start, the first slow one after it begins at its end. The speed falls
-    to that of a span in its middle, half a frame nearer to the change in the mean.
+    The speed falls to that of a span in its middle, half a frame nearer to the change in the mean.
     """
     return np.asarray((end - start + LATERAL_SPAN - 1) * DT, dtype=np.float64)
 
@@ -304,9 +303,6 @@ def hard_brake_events(trajectories: Trajectories) -> Events:
 
 
 def braking_exposure(tracks: Iterable[FloatArray]) -> tuple[float, float]:
-    """Return for how long [s] and how far [m] vehicles were seen such that a braking could have begun.
-
-    Each track has the positions along the road of one vehicle at consecutive ticks (T,) [m].
-    """
+    """Return for how long [s] and how far [m] tracks (T,) [m] were seen so that a braking could have begun."""
     seen = [x[END_TICKS : len(x) - END_TICKS] for x in tracks if len(x) >= SHORTEST_TRACK]
     return sum(len(x) * DT for x in seen), float(sum(np.ptp(x) for x in seen))

@@ -32,8 +32,7 @@ LANE_SPACINGS = (2.5, 5.0)
 class RoadAxis:
     """Curve along a road in the plane: w = curve(u) [m] in a frame turned about an origin so that u follows the road.
 
-    The frame of (u, w) is right-handed to (x, y) and so keeps its sense: with y downwards, as in pictures, w is to the
-    right of u.
+    The frame is right-handed to (x, y): with y downwards, as in pictures, w is to the right of u.
     """
 
     origin: FloatArray
@@ -65,14 +64,11 @@ def _turn(x: FloatArray, y: FloatArray, origin: FloatArray, direction: FloatArra
 
 
 def fit_road_axis(x: FloatArray, y: FloatArray, lane: NDArray[np.int64], heading: FloatArray) -> RoadAxis:
-    """Return the axis that the lanes of a road run parallel to.
+    """Return the axis of the lanes of a road, of positions [m] and lanes (n,) and a rough direction of travel (2,).
 
     A cubic spline (penalised as in Eilers and Marx, "Flexible smoothing with B-splines and penalties", 1996) is fitted
     to the mean positions in each lane every `BIN`, together with one distance for each lane. The road may turn by less
-    than a right angle, and lanes must keep their distance from each other; ramps do not, and pull at the axis by
-    their share of the traffic.
-
-    Positions [m] and numbers of lanes have shape (n,); the direction of travel is given roughly, as a vector (2,).
+    than a right angle; ramps, which do not keep their distance, pull at the axis by their share of the traffic.
     """
     origin = np.array([x.mean(), y.mean()])
     axis = np.linalg.eigh(np.cov(np.stack([x, y])))[1][:, -1]
@@ -127,11 +123,10 @@ def lanes_of(y: FloatArray, edges: tuple[float, ...]) -> NDArray[np.int64]:
 
 
 def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, ...]:
-    """Return lane boundaries [m], left to right, halfway between the median positions of neighbouring lanes.
+    """Return lane boundaries [m], left to right, halfway between the median positions of neighbouring lanes (rows,).
 
-    The outer lanes get the width of the space to their neighbours. Lanes (rows,) are counted from 1 as long as each
-    lies 2.5 to 5 m to the right of the one before it; ramps, which lie beside each other, do not. Of fewer than two
-    lanes there are none.
+    Lanes count from 1 as long as each lies in `LANE_SPACINGS` to the right of the one before it; ramps do not. The
+    outer ones get the width of the space to their neighbours; of fewer than two there are none.
     """
     centres: list[float] = []
     for number in range(1, int(lane.max()) + 1):
@@ -148,10 +143,7 @@ def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, 
 
 
 def number_lanes(y: FloatArray, lane: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return lanes (rows,) numbered from the left, 1 the leftmost, by their median positions [m], to the right.
-
-    Lanes of the file of the other sign than most, and 0, are outside the lanes: 0.
-    """
+    """Return lanes (rows,) counted from the left by their median positions [m]; 0 where of the rarer sign, or 0."""
     inside = lane * (1 if (lane > 0).sum() >= (lane < 0).sum() else -1) > 0
     result = np.zeros(len(lane), dtype=np.int64)
     numbers = np.unique(lane[inside])

@@ -168,10 +168,7 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
 def find_leaders(
     vehicle: NDArray[Any], frame: NDArray[Any], lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None
 ) -> NDArray[Any]:
-    """Return the numbers of the nearest vehicles ahead in the same lane, of columns (rows,), positions in m.
-
-    `NOBODY` where nobody is ahead, or the lane is 0, which is none. Without names of recordings all are of one.
-    """
+    """Return the nearest vehicles ahead in the same lane, of columns (rows,), x in m; `NOBODY` where none is."""
     group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
     order = np.lexsort([x, lane, frame, group])
     same = np.logical_and.reduce([np.diff(values[order]) == 0 for values in (lane, frame, group)])
@@ -348,8 +345,8 @@ def resample_tracks(
 ) -> tuple[dict[str, FloatArray], NDArray[np.intp]]:
     """Return columns (rows,) of tracks at multiples of `DT`, cut at holes, and the rows nearest in time (rows,).
 
-    Vehicle, time [s] and the columns, which are interpolated by cubic splines or linearly, have shape (n,); rows of a
-    vehicle are dt apart [s]. The columns have `vehicle` and `frame`, the time in units of `DT`, beside them.
+    Vehicle, time [s] and the columns, interpolated by cubic splines or linearly, have shape (n,), rows of a vehicle dt
+    apart [s]. `vehicle` and `frame`, the time in units of `DT`, are beside them.
     """
     order = np.lexsort([time, vehicle])
     cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > LARGEST_STEP * dt))

@@ -176,10 +176,7 @@ def format_base(scenario: str, content: Mapping[str, Any]) -> str:
 
 
 def mass_outside(distribution: TruncatedGaussianMixture, seed: int = 0) -> dict[str, Any]:
-    """Return the probability that the box cuts away from the mixture without its box.
-
-    `any` is that some column of x is outside, with its `standard_error`; `each` is the same per column.
-    """
+    """Return the probability that the box cuts away from the mixture, by any column and by each."""
     coordinates, rng = distribution.coordinates, np.random.default_rng(seed)
     counts = rng.multinomial(MASS_SAMPLES, distribution.weights)
     parts = [
@@ -231,10 +228,7 @@ CHECKED: dict[str, tuple[dict[str, State], tuple[tuple[str, str, str], ...]]] = 
 def check_predictions(
     scenario: str, names: Sequence[str], events: FloatArray, distribution: Distribution, seed: int = 0
 ) -> tuple[PredictiveCheck, ...]:
-    """Compare recorded with expected counts of dangerous states: one check for each state and pair of vehicles.
-
-    Events (n, k) have the first k columns of x, which are named; a scenario that is not in `CHECKED` has no checks.
-    """
+    """Return recorded and expected counts of dangerous states of events (n, k), the first k named columns."""
     if scenario not in CHECKED:
         return ()
     states, groups = CHECKED[scenario]

@@ -145,10 +145,7 @@ def fit_system(
     starts: int | None = None,
     most: int = MAX_COMPONENTS,
 ) -> SystemFit:
-    """Fit a mixture of `most` components at most in one system; columns apart get one component of their own.
-
-    The parameters are those of the scenario in the order of x, the system has the coordinates of all of them.
-    """
+    """Return a mixture of `most` components at most in one system; columns apart get one component of their own."""
     n = events.joint.shape[1]
     components, candidates = _fit_in(system.coordinates(parameters[:n]), events.joint, seed, most, starts)
     bic_apart = 0.0
@@ -176,10 +173,7 @@ def held_out_log_prob(
     seed: int = 0,
     most: int = MAX_COMPONENTS,
 ) -> FloatArray:
-    """Return the log density of each event under a fit to the other folds, shape (n,), columns apart left out.
-
-    Folds are made of whole clusters. NaN where a fold leaves too few events to fit.
-    """
+    """Return the log density of each event (n,) under a fit to the other folds of clusters; NaN where too few."""
     names = np.random.default_rng(seed).permutation(np.unique(events.clusters))
     own = parameters[: events.joint.shape[1]]
     scores = np.full(len(events.joint), np.nan)
@@ -232,10 +226,9 @@ def refit(
     n: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[SystemFit, ...]:
-    """Return n refits, each in the coordinate system that its events support best by the BIC.
+    """Return n refits, each in the coordinate system that its events support best by the BIC; `report` is told of each.
 
-    With None there are `N_REFITS`, or `MORE_REFITS` where coordinates or components differ among these; none where
-    there are fewer than `MIN_CLUSTERS` clusters. `report` is told of each.
+    None: `N_REFITS`, or `MORE_REFITS` where families differ among these. There are none of under `MIN_CLUSTERS`.
     """
     if len(np.unique(events.clusters)) < MIN_CLUSTERS:
         return ()

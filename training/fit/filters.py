@@ -142,11 +142,7 @@ def drop_events(keep: NDArray[np.bool_], rules: Iterable[Rule], columns: Sequenc
 
 
 def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: Sequence[Parameter]) -> EventSet:
-    """Return the usable events of an events file (columns by name), for parameters in ranges, the box.
-
-    `log` has per filter its rule, its reason and the number of events it dropped of those that passed the filters
-    before. The filters of the separate columns come last.
-    """
+    """Return the usable events of columns by name, for parameters in a box, and what each filter dropped."""
 
     def usual_rules(columns: Sequence[str], ranges: Sequence[Parameter]) -> Iterator[Rule]:
         for column in columns:

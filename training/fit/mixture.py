@@ -110,10 +110,7 @@ def append_independent(joint: Components, apart: Components) -> Components:
 
 
 def fit_mixture(points: FloatArray, components: int, floor: float, seed: int, starts: int) -> tuple[Components, float]:
-    """Return the likeliest of the mixtures that k-means starts lead to, and the log likelihood of all points (n, d).
-
-    The floor is added to the variances of each component.
-    """
+    """Return the likeliest mixture that k-means starts lead to, and the log likelihood of all points (n, d)."""
     n, d = points.shape
     products = (points[:, :, None] * points[:, None, :]).reshape(n, d * d)
     monomials = np.ascontiguousarray(np.hstack([np.ones((n, 1)), points, products]).T)

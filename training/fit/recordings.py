@@ -158,20 +158,10 @@ def fit_bases(
     seed: int = 0,
     progress: bool = False,
 ) -> list[Path]:
-    """Fit base distributions to recordings, or those of the package to its events; return their files.
+    """Fit base distributions to recordings, or those of the package to its events; return their files in a folder.
 
-    A scenario with too few events is left out with a line on standard error, unless there is no other. A ValueError or
-    an OSError says which argument, file or recording is wrong.
-
-    Args:
-        recordings: Where they are, and of which format.
-        out: Folder of the files.
-        cut_gaps: Cut tracks where frames are missing.
-        scenarios: Names of the scenarios to fit; None for all that have enough events.
-        name: Name of the bases.
-        n_refits: Number of refits, see `refit`.
-        seed: Seed of the fits.
-        progress: Whether lines on standard error say how far it has come.
+    None of the scenarios stands for all that have enough events; the others are left out with a line on standard error,
+    unless there is none. A ValueError or an OSError says which argument, file or recording is wrong.
     """
     kind, path = recordings.kind_and_path()
     known = tuple(EVENT_RECIPES)

@@ -137,10 +137,9 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
 
 
 def _read_i24_leaders(folder: Path) -> Read:
-    """Return new leaders of the instrumented car on the I-24, within the ranges of the scenario.
+    """Return new leaders of the instrumented car on the I-24, each the beginning of car-following, within the ranges.
 
-    A cut-in, an own lane change and a leader that leaves the lane all give the car a new leader; each is the beginning
-    of car-following. The record has the speed of the vehicle ahead on drives with radar only.
+    The record has the speed of the vehicle ahead on drives with radar only.
     """
     rows = read_columns(folder / CIRCLES_FILE, ("drive", "t", "speed", "gap", "rel_speed", "radar"))
     parts, drives = [np.empty((0, 3))], [np.empty(0, dtype=np.int64)]

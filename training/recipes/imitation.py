@@ -272,10 +272,7 @@ def learn_labels(policy: Policy, data: Sequence[Labelled], plan: Corrections, rn
 def correct_ego(
     before: LearnedDriver, plan: Corrections, recorded: Tensor
 ) -> tuple[LearnedDriver, list[dict[str, Any]]]:
-    """Return a corrected copy of an ego, and for each round and scenario searched a record, see `correct`.
-
-    Of what recorded people perceived (n, 51) it is to make what it did.
-    """
+    """Return a corrected ego, which keeps what it did where people were (n, 51), and the records of `correct`."""
     rng, teacher = np.random.default_rng(plan.seed), before.policy
     driver = replace(before, policy=copy.deepcopy(teacher))
     some = recorded[torch.from_numpy(rng.integers(0, len(recorded), plan.recorded))]

@@ -213,10 +213,7 @@ class Verdicts(NamedTuple):
 
 
 def judge(ego: Any, case: str = "straight", rollouts: int = 400, seed: int = 0, seconds: float = SECONDS) -> Verdicts:
-    """Return for each rollout in one of `CASES` whether an ego keeps its lane and its distance.
-
-    The ego is one as `rare_envs.DrivingProblem` takes it; the seed is that of the starts and of the others' noise.
-    """
+    """Return verdicts on an ego, as `rare_envs.DrivingProblem` takes it, in one of `CASES`, from a seed."""
     needs = resolve(ego)
     world = make_world(CASES[case], seconds, needs.observation)
     driver = as_driver(ego, world, needs)

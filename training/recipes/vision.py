@@ -139,10 +139,7 @@ def expert_outputs(episode: Episode, brakes: float = VISION_EXPERT.max_decelerat
 
 
 def auxiliary_targets(episode: Episode) -> Tensor:
-    """Return what the expert decides by, as far as a picture shows it, in units of about 1, shape (B, 5).
-
-    Offset from the lane's middle, heading, curvature of the road, nearness of the lead and its rate of approach.
-    """
+    """Return offset, heading, curvature, nearness and approach of the lead, in units of about 1, (B, 5)."""
     state, road, lead = episode.state, episode.road, episode.lead
     near = (10.0 / lead.gap.clamp(min=2.0)).clamp(max=3.0)
     offset = (state.y[:, 0] - road.centre_of(state.y[:, 0])) / 0.5

@@ -14,13 +14,7 @@ from samplers.sample import clopper_pearson, effective_sample_size
 
 
 def estimate_naive(f: FloatArray, gamma: float) -> dict[str, Any]:
-    """Return P[f <= gamma] from outcomes f (n,): n, events, p, standard error as the paper has it, 95 % interval.
-
-    Example:
-        >>> found = estimate_naive(np.array([0.1, 0.5, 0.9, 0.9]), gamma=0.5)
-        >>> found["events"], found["p"], found["standard_error"]
-        (2, 0.5, 0.25)
-    """
+    """Return P[f <= gamma] from outcomes f (n,): n, events, p, standard error as in the paper, 95 % interval."""
     n, events = len(f), int(np.count_nonzero(f <= gamma))
     p, interval = events / n, clopper_pearson(events, n, 0.95)
     found = {"gamma": gamma, "n": n, "events": events, "p": p, "standard_error": math.sqrt(p * (1 - p) / n)}
@@ -28,13 +22,7 @@ def estimate_naive(f: FloatArray, gamma: float) -> dict[str, Any]:
 
 
 def estimate_weighted(f: FloatArray, log_ratios: FloatArray, gamma: float) -> dict[str, Any]:
-    """Return the same as the mean of likelihood ratio times indicator of failure, with the effective number of events.
-
-    Example:
-        >>> found = estimate_weighted(np.array([0.1, 0.9]), np.log([0.5, 2.0]), gamma=0.5)
-        >>> found["events"], found["p"]
-        (1, 0.25)
-    """
+    """Return the same as the mean of likelihood ratio times indicator, with the effective number of events."""
     n, fails = len(f), f <= gamma
     terms = np.where(fails, np.exp(log_ratios), 0.0)
     return {
@@ -60,12 +48,6 @@ def compare_with_naive(found: Mapping[str, Any], reference: Mapping[str, Any], s
         error_ratio: The same with the squared distance from the longest naive estimate beside the sample variance: what
             is left of the gain if the sampler has missed failures.
         errors_off: Distance of the two estimates in their joint standard error.
-
-    Example:
-        >>> naive = {"gamma": 0.5, "n": 10_000, "events": 10, "p": 1e-3, "standard_error": 3.2e-4}
-        >>> both = compare_with_naive({**naive, "n": 1000, "events": 50, "standard_error": 2e-4}, naive, search=4000)
-        >>> both["events_ratio"], round(both["variance_ratio"], 1), round(both["all_in"], 1)
-        (50.0, 25.0, 5.0)
     """
     p, error = reference["p"], found["standard_error"]
     distance, variance = found["p"] - p, p * (1.0 - p)

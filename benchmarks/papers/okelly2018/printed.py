@@ -64,11 +64,6 @@ def find_errors_off(ego: str, j: int) -> float:
 
 
 def describe_printed(ego: str) -> dict[str, Any]:
-    """Return a table of the paper, with what follows from it.
-
-    Example:
-        >>> [round(ratio, 1) for ratio in describe_printed("lidar")["variance_ratios"]]
-        [1.6, 3.6, 1.5, 0.9]
-    """
+    """Return a table of the paper, with what follows from it."""
     table = PRINTED_TABLES[ego]
     return {**table, "variance_ratios": [find_variance_ratio(ego, j) for j in range(len(table["thresholds"]))]}

@@ -42,11 +42,7 @@ SOURCE = (
 
 
 def reproduce_okelly2018(rollouts: RolloutFolder, command: str) -> dict[str, Any]:
-    """Make the rollouts that a folder does not have yet, and write record and figures of what there is.
-
-    Raises:
-        BadInput: The folder has rollouts of something else, or damaged ones.
-    """
+    """Make the rollouts that a folder lacks, write record and figures; BadInput if it has some of something else."""
     study, out = rollouts.study, rollouts.folder
     check_folder(out, study.identity)
     found = summarise_highway(study, rollouts.problem, measure_highway(rollouts))
@@ -182,13 +178,7 @@ def _summarise_search(study: HighwayStudy, name: str, run: SearchRun, naive: Flo
 
 
 def compare_own(own: dict[str, Any], references: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Add the gain over naive Monte Carlo at as many simulations, by the method's own c.o.v.
-
-    Example:
-        >>> own = {"gamma": 0.5, "p": 1e-3, "cov": 0.1, "n_sim": 1000}
-        >>> round(compare_own(own, [{"gamma": 0.5, "p": 1e-3}])["gain"], 1)
-        99.9
-    """
+    """Add the gain over naive Monte Carlo at as many simulations, by the method's own c.o.v."""
     p = next((each["p"] for each in references if each["gamma"] == own["gamma"]), 0.0)
     error = own["p"] * own["cov"]
     gain = p * (1.0 - p) / own["n_sim"] / error**2 if p > 0.0 and 0.0 < error < float("inf") else None

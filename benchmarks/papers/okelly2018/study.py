@@ -44,12 +44,7 @@ WAITING = 64
 
 @dataclass(frozen=True)
 class HighwayStudy:
-    """What is to be measured.
-
-    Example:
-        >>> HighwayStudy("lidar", "full").settings.naive
-        1300000
-    """
+    """What is to be measured."""
 
     ego: str = "lidar"
     scale: str = "small"
@@ -211,10 +206,7 @@ def measure_highway(rollouts: RolloutFolder) -> MeasuredHighway:
 
 
 def run_search(rollouts: RolloutFolder, number: int, settings: SearchSettings) -> SearchRun:
-    """Run algorithm 1 and draw from the sampler that it chooses, as far as rollouts may be made.
-
-    Its files are `search_NUMBER.jsonl` and `final_NUMBER.jsonl`.
-    """
+    """Run algorithm 1 and draw from the sampler it chooses: `search_NUMBER.jsonl` and `final_NUMBER.jsonl`."""
     study, scale, base = rollouts.study, rollouts.study.settings, make_base(rollouts.problem, settings)
     run, sampler, title = SearchRun(base), base, f"search {number} of {len(SEARCHES)}"
     for k in range(scale.iterations):

@@ -204,13 +204,7 @@ _SHOWN_RATIOS = (1e-4, 1e4)
 
 
 def list_thresholds(gammas: Sequence[float]) -> list[float]:
-    """Return the thresholds of the curves, from the rarest in the table to a tenth beyond its last.
-
-    Example:
-        >>> thresholds = list_thresholds((0.4, 0.5))
-        >>> len(thresholds), thresholds[0], thresholds[-1]
-        (16, 0.4, 0.55)
-    """
+    """Return the thresholds of the curves, from the rarest in the table to a tenth beyond its last."""
     return [round(float(gamma), 4) for gamma in np.linspace(gammas[0], 1.1 * gammas[-1], POINTS)]
 
 

@@ -213,10 +213,7 @@ def _thin_trace(result: Estimate) -> list[list[float]]:
 
 
 def _subsets(result: Estimate, dim: int) -> tuple[list[list[float]], list[list[list[float]]]]:
-    """Return, of the points that each level of subset simulation found in its subset, the means and some of them.
-
-    `dim` is the number of parameters that are not noise, the first of x.
-    """
+    """Return means and some of the points (n, dim) that each level of subset simulation found."""
     assert result.points is not None
     x, f = result.points.x[:, :dim], result.points.f
     stage = result.describe_simulations(0, result.n_sim).stage

@@ -40,13 +40,7 @@ SCALES = {"small": 5, "full": 20}
 
 @dataclass(frozen=True)
 class TianPlan:
-    """What is to be run.
-
-    Example:
-        >>> plan = TianPlan(replications=20)
-        >>> len(plan.jobs()), plan.jobs()[0].method, plan.jobs()[-1].method
-        (640, 'IS', 'MC')
-    """
+    """What is to be run."""
 
     replications: int = SCALES["full"]
     seed: int = 0
@@ -82,11 +76,7 @@ class TianPlan:
 def reproduce_tian2024(
     plan: TianPlan, out: Path, command: str, workers: int = 1, progress: bool = False
 ) -> dict[str, Any]:
-    """Make the replications that a folder does not have yet, write record and figures, and return the record.
-
-    Raises:
-        BadInput: The folder has runs of something else or of other code, or damaged ones.
-    """
+    """Make the replications that a folder lacks, write record and figures; BadInput if it has other ones."""
     check_folder(out, plan.identity)
     out.mkdir(parents=True, exist_ok=True)
     lines = open_replications(out, plan)
