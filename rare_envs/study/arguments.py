@@ -130,7 +130,7 @@ _KINDS: dict[str, tuple[tuple[type, ...], str]] = {
 """Words in the annotations of fields to types in JSON, and to what messages call them."""
 
 
-def argument(default: Any, help: str, **about: Any) -> Any:
+def arg(default: Any, help: str, **about: Any) -> Any:
     """Return a field with the text of its option."""
     return field(default=default, metadata={"help": help, **about})
 
@@ -146,68 +146,54 @@ class Question:
     """
 
     env_id: str = field(metadata={"help": "Environment, such as rare_envs/CutIn-v0.", "option": "env"})
-    base: str | None = argument(None, "Base distribution: a name or a JSON file.")
-    drivers: str | None = argument(
-        None, "Of the vehicles around: mgail, mgail?rules=0, gail, idm, idm+mobil or a file."
-    )
-    observation: str | None = argument(
+    base: str | None = arg(None, "Base distribution: a name or a JSON file.")
+    drivers: str | None = arg(None, "Of the vehicles around: mgail, mgail?rules=0, gail, idm, idm+mobil or a file.")
+    observation: str | None = arg(
         None,
         "Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
         "one that the ego's space fits.",
     )
-    action: str | None = argument(
+    action: str | None = arg(
         None,
         "Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second; by default "
         "those that its space fits.",
     )
-    horizon: float | None = argument(None, "Length of an episode in seconds.")
-    noise: bool | str = argument(True, "The drivers' noise: part of x, one fixed sequence, none.")
-    weather: bool = argument(False, "Make weather and the camera's noise parameters.")
-    method: str = argument("auto", "Estimation method; see rare-envs list methods.")
-    measure: str = argument("ttc", "Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
-    gamma: float = argument(0.0, "Threshold: P[f <= gamma]; 0 counts collisions.")
-    seed: int = argument(0, "Seed; the same seed gives the same answer.", count=True)
-    collisions: str = argument("ego", "Which count: ego, or any, between others too.")
-    device: str = argument(
+    horizon: float | None = arg(None, "Length of an episode in seconds.")
+    noise: bool | str = arg(True, "The drivers' noise: part of x, one fixed sequence, none.")
+    weather: bool = arg(False, "Make weather and the camera's noise parameters.")
+    method: str = arg("auto", "Estimation method; see rare-envs list methods.")
+    measure: str = arg("ttc", "Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
+    gamma: float = arg(0.0, "Threshold: P[f <= gamma]; 0 counts collisions.")
+    seed: int = arg(0, "Seed; the same seed gives the same answer.", count=True)
+    collisions: str = arg("ego", "Which count: ego, or any, between others too.")
+    device: str = arg(
         "cpu", "Where torch simulates: cpu, or a GPU (cuda, cuda:1), which leaves numba out: docs/executors.md."
     )
-    ensemble_run: bool = argument(
+    ensemble_run: bool = arg(
         True,
         "Where the failures found do not reach the refits of the base, simulate up to as much again under these.",
         flags="--ensemble-run/--no-ensemble-run",
     )
-    trust: bool = argument(
-        False, "Let code run: of the ego's .zip, though others can write to it; of a run from elsewhere."
-    )
-    ego: str = argument(
-        "idm", "A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos."
-    )
-    algo: str | None = argument(None, "Algorithm of the .zip, if the file does not tell.")
-    stats: str | None = argument(
-        None, "File of the .zip's VecNormalize statistics; by default one is looked for beside it."
-    )
-    ensemble: bool = argument(False, "Take the mixture of the refits of the base: p for the next event.")
-    also_under: str | None = argument(
-        None, "State p under these bases too, by the same simulations: us101-closing,i80."
-    )
-    max_sim: int | None = argument(
+    trust: bool = arg(False, "Let code run: of the ego's .zip, though others can write to it; of a run from elsewhere.")
+    ego: str = arg("idm", "A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos.")
+    algo: str | None = arg(None, "Algorithm of the .zip, if the file does not tell.")
+    stats: str | None = arg(None, "File of the .zip's VecNormalize statistics; by default one is looked for beside it.")
+    ensemble: bool = arg(False, "Take the mixture of the refits of the base: p for the next event.")
+    also_under: str | None = arg(None, "State p under these bases too, by the same simulations: us101-closing,i80.")
+    max_sim: int | None = arg(
         None, "Largest number of simulations.", count=True, show_default="that of the method, 6,000 for two-stage"
     )
-    target_cov: float | None = argument(None, "Stop at this coefficient of variation.")
-    replicates: int = argument(1, "Independent runs, combined by their mean.")
-    on_error: str = argument("raise", "Where the ego fails twice: raise, failure or bound.")
-    chunk: int | None = argument(
-        None, "Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules."
-    )
-    core: str = argument(
-        "auto", "What simulates: torch, numba (compiled, where it can be had: docs/executors.md), or auto."
-    )
-    sensitivity: bool = argument(False, "Show what p is sensitive to: parameters of traffic and of its model.")
-    max_p: float | None = argument(
+    target_cov: float | None = arg(None, "Stop at this coefficient of variation.")
+    replicates: int = arg(1, "Independent runs, combined by their mean.")
+    on_error: str = arg("raise", "Where the ego fails twice: raise, failure or bound.")
+    chunk: int | None = arg(None, "Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules.")
+    core: str = arg("auto", "What simulates: torch, numba (compiled, where it can be had: docs/executors.md), or auto.")
+    sensitivity: bool = arg(False, "Show what p is sensitive to: parameters of traffic and of its model.")
+    max_p: float | None = arg(
         None, "Limit of p: the exit code is 0 if it passes, 4 if it fails, 5 if that is undecided."
     )
-    gate_confidence: float = argument(0.95, "One-sided, of the comparison with --max-p.", option="confidence")
-    given_base: bool = argument(False, "Compare with --max-p as if the base distribution were the true one.")
+    gate_confidence: float = arg(0.95, "One-sided, of the comparison with --max-p.", option="confidence")
+    given_base: bool = arg(False, "Compare with --max-p as if the base distribution were the true one.")
 
     def __post_init__(self) -> None:
         """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""
@@ -257,13 +243,11 @@ class Question:
 class ExecutorOptions:
     """Where simulations are made; none of these options changes the answer."""
 
-    workers: int | None = argument(None, "Processes that simulate; by default this one, or all cores of --executor.")
-    executor: str | None = argument(None, "Where they are: local processes, or the machines of a Ray cluster.")
-    address: str | None = argument(None, "Of the Ray cluster, or auto; by default one is started on this machine.")
-    time_limit: float | None = argument(
-        None, "Seconds for a chunk of simulations, after which its worker counts as hung."
-    )
-    memory_limit: float | None = argument(None, "GiB that the simulations of a worker process may take (Linux).")
+    workers: int | None = arg(None, "Processes that simulate; by default this one, or all cores of --executor.")
+    executor: str | None = arg(None, "Where they are: local processes, or the machines of a Ray cluster.")
+    address: str | None = arg(None, "Of the Ray cluster, or auto; by default one is started on this machine.")
+    time_limit: float | None = arg(None, "Seconds for a chunk of simulations, after which its worker counts as hung.")
+    memory_limit: float | None = arg(None, "GiB that the simulations of a worker process may take (Linux).")
 
     def make(self) -> Executor | None:
         """Return the executor; None for this process."""

@@ -55,18 +55,6 @@ def note_question(question: Question) -> None:
                 file.write(f"{digest}\n")
 
 
-def check_trust(question: Question, folder: Path, trust: bool) -> None:
-    """Refuse a folder's question that names code, unless it is trusted or was asked here."""
-    code = list_code(question)
-    if code and not trust and _digest_code(question) not in _read_notes():
-        files = {name: find_module_file(name) for name in code}
-        named = ", ".join(f"{name!r}{f' ({path})' if path else ''}" for name, path in files.items())
-        raise BadInput(
-            f"The run in {str(folder)!r} was not made here, and its question runs code: {named}. Look at that code, "
-            "then add --trust (trust=True)."
-        )
-
-
 def find_module_file(name: str) -> Path | None:
     """Return the file of the module in `module:name`, found without running anything; None if there is none."""
     parts = name.partition(":")[0].split(".")
@@ -295,8 +283,14 @@ def open_question(recorded: object, folder: Path, trust: bool) -> Question:
     question = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
         raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
-    with as_bad_input(ValueError):
-        check_trust(question, folder, trust)
+    code = list_code(question)
+    if code and not trust and _digest_code(question) not in _read_notes():
+        files = {name: find_module_file(name) for name in code}
+        named = ", ".join(f"{name!r}{f' ({path})' if path else ''}" for name, path in files.items())
+        raise BadInput(
+            f"The run in {str(folder)!r} was not made here, and its question runs code: {named}. Look at that code, "
+            "then add --trust (trust=True)."
+        )
     return question
 
 

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import as_bad_input
@@ -73,7 +74,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def common_options(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+        bool, Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """How often does a driving policy crash? Train one, estimate its rare failures, see the most likely."""
@@ -83,7 +84,7 @@ def common_options(
 def list_command(
     what: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="[WHAT]", help="environments, methods, egos, drivers, measures, weather, all, or an environment."
         ),
     ] = None,
@@ -100,7 +101,7 @@ def list_command(
 
 @command()
 def bases_command(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
+    scenario: Annotated[str, Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
 ) -> Answer:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
     from rare_envs.study.cli.listing import list_bases, print_bases

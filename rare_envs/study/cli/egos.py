@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder
 from rare_envs.study.cli import shell
@@ -29,32 +29,32 @@ def train_ego_command(
     asked: dict[str, Any],
     env: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="[ENV]",
             help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it.",
             callback=shell.read_environment,
         ),
     ] = None,
     algo: Annotated[
-        str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
+        str | None, Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
     ] = None,
     steps: Annotated[
-        int, typer.Option(help="Environment steps to train for.", parser=shell.read_count, metavar="INTEGER")
+        int, Option(help="Environment steps to train for.", parser=shell.read_count, metavar="INTEGER")
     ] = 200_000,
-    out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
-    num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
-    device: Annotated[str, typer.Option(help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a training that was interrupted.")] = False,
+    out: Annotated[Path, Option(help="File to save the ego in.")] = Path("ego.zip"),
+    num_envs: Annotated[int, Option(help="Episodes that run side by side.")] = 256,
+    device: Annotated[str, Option(help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
+    resume: Annotated[bool, Option("--resume", help="Go on with a training that was interrupted.")] = False,
     from_failures: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             metavar="RUN",
             help="Train the ego of this run of rare-envs estimate on, with its failures among ordinary scenarios; "
             "repeated, the ego of the last run with the failures of all.",
         ),
     ] = None,
     failure_share: Annotated[
-        float, typer.Option(help="Share of episodes that begin in a failure, with --from-failures.")
+        float, Option(help="Share of episodes that begin in a failure, with --from-failures.")
     ] = 0.25,
 ) -> Answer:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`.
@@ -125,15 +125,15 @@ def train_drivers_command(out: RunFolderOption, recordings: RecordingOptions, op
 @spread_options
 @command()
 def fit_command(
-    out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
+    out: Annotated[Path, Option(help="Folder for the JSON files.")],
     recordings: EventOptions,
-    cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
+    cut_gaps: Annotated[bool, Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
     scenario: Annotated[
-        list[str] | None, typer.Option(help="Which to fit, may be repeated; all that have enough events by default.")
+        list[str] | None, Option(help="Which to fit, may be repeated; all that have enough events by default.")
     ] = None,
-    name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
-    refits: Annotated[int | None, typer.Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
+    name: Annotated[str, Option(help="Name of the bases of your own recordings.")] = "own",
+    refits: Annotated[int | None, Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
+    seed: Annotated[int, Option(help="Seed of the fits.", min=0)] = 0,
 ) -> Answer:
     """Fit base distributions to recorded traffic, with refits that say how far the events determine them."""
     from training.fit.recordings import fit_bases
@@ -151,8 +151,8 @@ def check_ego_command(
     ego: shell.EgoArgument,
     env: shell.EnvArgument,
     asked: dict[str, Any],
-    time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
-    show_all: Annotated[bool, typer.Option("--all", help="Show each check that passed in a row of its own.")] = False,
+    time_limit: Annotated[float, Option(help="Seconds that one check may take.")] = 30.0,
+    show_all: Annotated[bool, Option("--all", help="Show each check that passed in a row of its own.")] = False,
 ) -> Answer:
     """Check in seconds whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
     from rare_envs.study.ego_check import VERDICTS, exit_code, print_findings
@@ -169,9 +169,7 @@ def check_ego_command(
 def serve_ego_command(
     ego: shell.EgoArgument,
     asked: dict[str, Any],
-    bind: Annotated[
-        str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
-    ] = "tcp://127.0.0.1:5555",
+    bind: Annotated[str, Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")] = "tcp://127.0.0.1:5555",
 ) -> None:
     """Serve an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
     import agents
@@ -195,8 +193,8 @@ def serve_ego_command(
 @command(*shell.EGO_FILE, "trust")
 def export_ego_command(
     asked: dict[str, Any],
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
+    model: Annotated[Path, Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
+    out: Annotated[Path, Argument(metavar="OUT", help="The .onnx file to write.")],
 ) -> Answer:
     """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
     if model.suffix != ".zip":

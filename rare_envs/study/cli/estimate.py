@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from rare_envs.scenarios.registry import find_scenario, is_highway_env_id
 from rare_envs.study.arguments import (
@@ -46,12 +46,12 @@ def estimate_command(
     places: dict[str, Any],
     typed: set[str],
     env: Annotated[
-        str | None, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config.")
+        str | None, Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config.")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
+        Path | None, Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
+    out: Annotated[Path | None, Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
     force: shell.ForceOption = False,
     details: shell.DetailsOption = False,
 ) -> Answer:
@@ -149,15 +149,13 @@ def _describe(question: Question, problem: Any, result: Estimate, out: Path | No
 
 @command("trust", stopped="Stopped before the run went on; what it had kept is still there.")
 def resume_command(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")
-    ],
+    run: Annotated[Path, Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")],
     asked: dict[str, Any],
     places: dict[str, Any],
-    ego: Annotated[str | None, typer.Option(help="New address of an ego in another program, tcp://...")] = None,
-    on_error: Annotated[str | None, typer.Option(help="Instead of what the run had: raise, failure or bound.")] = None,
+    ego: Annotated[str | None, Option(help="New address of an ego in another program, tcp://...")] = None,
+    on_error: Annotated[str | None, Option(help="Instead of what the run had: raise, failure or bound.")] = None,
     mend: Annotated[
-        bool, typer.Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
+        bool, Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
     ] = False,
     details: shell.DetailsOption = False,
 ) -> Answer:
@@ -173,16 +171,14 @@ def resume_command(
 @command(*shell.ASKED)
 def plan_command(
     target: Annotated[
-        str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
+        str, Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
     ],
     asked: dict[str, Any],
     typed: set[str],
-    cov: Annotated[
-        float, typer.Option("--cov", "--target-cov", help="Coefficient of variation that is wished for.")
-    ] = 0.1,
-    ego: Annotated[str, typer.Option(help="An ego, as for estimate --ego.")] = "idm",
+    cov: Annotated[float, Option("--cov", "--target-cov", help="Coefficient of variation that is wished for.")] = 0.1,
+    ego: Annotated[str, Option(help="An ego, as for estimate --ego.")] = "idm",
     pilot: Annotated[
-        int | None, typer.Option(help="Simulations of each pilot.", show_default="the method's own budget")
+        int | None, Option(help="Simulations of each pilot.", show_default="the method's own budget")
     ] = None,
 ) -> Answer:
     """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
@@ -220,17 +216,17 @@ def risk_command(
     ego: shell.EgoArgument,
     asked: dict[str, Any],
     leaders: Annotated[
-        str, typer.Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following.")
+        str, Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following.")
     ] = "cut-in",
     sites: Annotated[
         str,
-        typer.Option(help="Site of the bases, us101 or i80; both, joined by a comma, for the spread between sites."),
+        Option(help="Site of the bases, us101 or i80; both, joined by a comma, for the spread between sites."),
     ] = "us101",
     base: Annotated[
-        list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
+        list[str] | None, Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None,
     max_sim: Annotated[int | None, option_of("max_sim", help="Largest number of simulations of each scenario.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
     force: shell.ForceOption = False,
 ) -> Answer:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
@@ -266,16 +262,16 @@ def risk_command(
 
 @command(*shell.ASKED, stopped=NOTHING_MADE)
 def compare_command(
-    ego_a: Annotated[str, typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
-    ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
+    ego_a: Annotated[str, Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
+    ego_b: Annotated[str, Argument(metavar="EGO_B", help="The other ego.")],
     env: shell.EnvArgument,
     asked: dict[str, Any],
     max_sim: Annotated[
         int, option_of("max_sim", help="Largest number of simulations, of both egos together.", show_default=True)
     ] = 12_000,
-    algo_b: Annotated[str | None, typer.Option(help="As --algo, for the .zip of EGO_B.")] = None,
-    stats_b: Annotated[str | None, typer.Option(help="As --stats, for the .zip of EGO_B.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for comparison.json and failures.csv.")] = None,
+    algo_b: Annotated[str | None, Option(help="As --algo, for the .zip of EGO_B.")] = None,
+    stats_b: Annotated[str | None, Option(help="As --stats, for the .zip of EGO_B.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for comparison.json and failures.csv.")] = None,
     force: shell.ForceOption = False,
 ) -> Answer:
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""

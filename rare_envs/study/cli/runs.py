@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from rare_envs.study.arguments import BadInput, as_bad_input, output_file
 from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, RunArgument, command
@@ -20,20 +20,20 @@ FAILS = 4
 """Exit code where the ego fails in a stored scenario, as where p is above a limit."""
 MOST_SHOWN = 20
 """Trials that have a line."""
-CorpusOption = Annotated[Path, typer.Option(help="Folder of the corpus.")]
-FailureOption = Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")]
+CorpusOption = Annotated[Path, Option(help="Folder of the corpus.")]
+FailureOption = Annotated[int, Option(help="Which failure; 0 is the most likely.")]
 
 
 @command("trust")
 def report_command(
     run: RunArgument,
     asked: dict[str, Any],
-    out: Annotated[Path | None, typer.Option(help="The .html file; report.html in RUN by default.")] = None,
+    out: Annotated[Path | None, Option(help="The .html file; report.html in RUN by default.")] = None,
     events: Annotated[
         Path | None,
-        typer.Option(help="CSV of recorded events, with columns named as the parameters: how near they come."),
+        Option(help="CSV of recorded events, with columns named as the parameters: how near they come."),
     ] = None,
-    figures: Annotated[str | None, typer.Option(help="Figures as files too, beside the page: svg, pdf or png.")] = None,
+    figures: Annotated[str | None, Option(help="Figures as files too, beside the page: svg, pdf or png.")] = None,
 ) -> Answer:
     """Write the report of a run as one HTML file, with its failures by mode, driven again and filmed."""
     from rare_envs.study.html_report import write_html_report
@@ -48,7 +48,7 @@ def corpus_add_command(
     run: RunArgument,
     asked: dict[str, Any],
     corpus: CorpusOption = Path("corpus"),
-    most: Annotated[int, typer.Option(help="Failures to add: the most likely, and one of each kind of crash.")] = 20,
+    most: Annotated[int, Option(help="Failures to add: the most likely, and one of each kind of crash.")] = 20,
 ) -> Answer:
     """Add the failures of a run to a corpus, a file each, named by what is in it."""
     from rare_envs.study.corpus import add_run
@@ -60,10 +60,10 @@ def corpus_add_command(
 
 @command(*EGO_FILE, "observation", "action", "trust")
 def corpus_run_command(
-    ego: Annotated[str, typer.Option(help="The ego to try, as for estimate --ego.")],
+    ego: Annotated[str, Option(help="The ego to try, as for estimate --ego.")],
     asked: dict[str, Any],
     corpus: CorpusOption = Path("corpus"),
-    junit: Annotated[Path | None, typer.Option(help="File for a JUnit report.")] = None,
+    junit: Annotated[Path | None, Option(help="File for a JUnit report.")] = None,
 ) -> Answer:
     """Try an ego in all scenarios of a corpus. Exit code 0: it fails in none; 4: it does."""
     from rare_envs.study.corpus import read_corpus, try_ego, write_junit
@@ -126,12 +126,10 @@ def replay_command(
     asked: dict[str, Any],
     typed: set[str],
     failure: FailureOption = 0,
-    out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
-    ego: Annotated[
-        str | None, typer.Option(help="Another ego, as for estimate --ego, in the place of the run's.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
+    ego: Annotated[str | None, Option(help="Another ego, as for estimate --ego, in the place of the run's.")] = None,
     replay_each: Annotated[
-        bool, typer.Option("--all", help="Simulate all failures again and compare their f; without a film.")
+        bool, Option("--all", help="Simulate all failures again and compare their f; without a film.")
     ] = False,
 ) -> Answer:
     """Replay a failure that a run has found, and show it with its measure over time."""
@@ -173,14 +171,12 @@ def replay_command(
 def export_command(
     run: RunArgument,
     asked: dict[str, Any],
-    out: Annotated[Path, typer.Option(help="The .xosc to write, its road beside it as .xodr; .xml for CommonRoad.")],
+    out: Annotated[Path, Option(help="The .xosc to write, its road beside it as .xodr; .xml for CommonRoad.")],
     failure: FailureOption = 0,
-    format: Annotated[
-        str, typer.Option(help="openscenario, carla (for scenario_runner) or commonroad.")
-    ] = "openscenario",
+    format: Annotated[str, Option(help="openscenario, carla (for scenario_runner) or commonroad.")] = "openscenario",
     ego: Annotated[
         str | None,
-        typer.Option(help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free."),
+        Option(help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free."),
     ] = None,
 ) -> Answer:
     """Write a failure as OpenSCENARIO and OpenDRIVE, for CARLA's scenario_runner, or as CommonRoad XML."""

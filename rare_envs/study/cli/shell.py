@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_type_hints
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone
@@ -296,20 +297,20 @@ def option_of(name: str, owner: type[Any] = Question, **changes: Any) -> Any:
     field = next(each for each in fields(owner) if each.name == name)
     about = {key: field.metadata[key] for key in ("help", "show_default") if key in field.metadata} | changes
     if field.metadata.get("count"):
-        return typer.Option(parser=read_count, metavar="INTEGER", **about)
-    return typer.Option(field.metadata.get("flags", f"--{option_name(field).replace('_', '-')}"), **about)
+        return Option(parser=read_count, metavar="INTEGER", **about)
+    return Option(field.metadata.get("flags", f"--{option_name(field).replace('_', '-')}"), **about)
 
 
 EnvArgument = Annotated[
-    str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", callback=read_environment)
+    str, Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", callback=read_environment)
 ]
-EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
+EgoArgument = Annotated[str, Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+RunArgument = Annotated[Path, Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
+ForceOption = Annotated[bool, Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 DetailsOption = Annotated[
-    bool, typer.Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
+    bool, Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+JsonOption = Annotated[bool, Option("--json", help="Print one JSON object and nothing else.")]
 
 
 def command(*names: str, stopped: str = "") -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:

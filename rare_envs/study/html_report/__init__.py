@@ -38,8 +38,6 @@ __all__ = ["write_html_report"]
 
 BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
 """Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
-SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
-"""Ids of the sections of the page, in their order."""
 SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
 """Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
 

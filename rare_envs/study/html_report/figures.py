@@ -89,8 +89,7 @@ def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
     panels = _make_panels(figure, 2 if passes_levels(result) else 1, stacked)
     trace = [level for level in result.get("trace") or [] if level["run"] == 0]
     panels[0].bar(range(len(trace)), [level["p"] or 0.0 for level in trace], color=LINE_COLOUR)
-    panels[0].set_ylabel("share of the level's points with f ≤ threshold")
-    panels[0].set_ylim(0, 1)
+    panels[0].set(ylabel="share of the level's points with f ≤ threshold", ylim=(0, 1))
     for thresholds in panels[1:]:
         gammas = [np.nan if level["gamma"] is None else level["gamma"] for level in trace]
         thresholds.plot(gammas, "o-", color=LINE_COLOUR, markersize=4)
@@ -108,13 +107,9 @@ def draw_weights(figure: Figure, log_weights: FloatArray, p: float, stacked: boo
     parts = np.sort(np.exp(log_weights) / p)[::-1]
     shown = np.log10(parts[parts > 0])
     histogram.hist(shown, bins=min(40, max(5, len(shown) // 5)) if np.ptp(shown) > 0 else 1, color=LINE_COLOUR)
-    histogram.set_xlabel("share of p in one simulation, log10")
-    histogram.set_ylabel("failing simulations")
+    histogram.set(xlabel="share of p in one simulation, log10", ylabel="failing simulations")
     share.plot(np.arange(1, len(parts) + 1), 100 * np.cumsum(parts), color=LINE_COLOUR)
-    share.set_xlabel("heaviest failing simulations")
-    share.set_ylabel("share of p [%]")
-    share.set_ylim(0, 103)
-    share.set_xlim(left=0)
+    share.set(xlabel="heaviest failing simulations", ylabel="share of p [%]", xlim=(0, None), ylim=(0, 103))
 
 
 def draw_band(
@@ -151,9 +146,7 @@ def draw_parameters(
         failures: dict[str, Any] = {"color": HIT_COLOUR, "label": "failures", "histtype": "step", "linewidth": 1.5}
         axes.hist(ordinary[:, j], bins=bins, density=True, **usual)
         axes.hist(failing[:, j], bins=bins, density=True, weights=weights, **failures)
-        axes.set_xlabel(labels[j])
-        axes.set_yticks([])
-        axes.set_ylabel("density")
+        axes.set(xlabel=labels[j], yticks=[], ylabel="density")
     lines, words = panels[0].get_legend_handles_labels()
     figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
 

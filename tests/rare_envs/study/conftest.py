@@ -27,51 +27,35 @@ class Ego:
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         return self.choose(observation), state
 
-def coasting():
-    ego = Ego()
-    ego.choose = lambda observation: np.zeros((len(observation), 2), np.float32)
-    return ego
+def made(choose):
+    def make():
+        ego = Ego()
+        ego.choose = choose
+        return ego
+    return make
 
-def nan_actions():
-    ego = Ego()
-    ego.choose = lambda observation: np.full((len(observation), 2), np.nan)
-    return ego
-
-def nan_when_close():
-    ego = Ego()
-    ego.choose = lambda observation: np.where(observation[:, 3:4] < 0.1, np.nan, 0.0) * np.ones(2)
-    return ego
+def still(observation, width=2):
+    return np.zeros((len(observation), width), np.float32)
 
 def exiting():
     sys.exit(7)
 
-def exiting_when_asked():
-    ego = Ego()
-    ego.choose = lambda observation: sys.exit(7)
-    return ego
-
-def exiting_when_close():
-    ego = Ego()
-    ego.choose = lambda observation: sys.exit(7) if observation[:, 3].min() < 0.1 else np.zeros((len(observation), 2))
-    return ego
-
 def array():
     return np.zeros(2)
-
-def raising():
-    ego = Ego()
-    ego.choose = lambda observation: 1 / 0
-    return ego
 
 def wrong_space():
     ego = coasting()
     ego.observation_space = Box(-1.0, 1.0, (99,))
     return ego
 
-def wrong_shape():
-    ego = Ego()
-    ego.choose = lambda observation: np.zeros((len(observation), 5))
-    return ego
+coasting = made(still)
+nan_actions = made(lambda seen: still(seen) * np.nan)
+nan_when_close = made(lambda seen: np.where(seen[:, 3:4] < 0.1, np.nan, 0.0) * np.ones(2))
+exiting_when_asked = made(lambda seen: sys.exit(7))
+exiting_when_close = made(lambda seen: sys.exit(7) if seen[:, 3].min() < 0.1 else still(seen))
+raising = made(lambda seen: 1 / 0)
+wrong_shape = made(lambda seen: still(seen, 5))
+restless = made(lambda seen: np.random.uniform(-1, 1, (len(seen), 2)))
 """
 
 

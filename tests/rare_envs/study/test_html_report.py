@@ -15,7 +15,7 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
-from rare_envs.study.html_report import SECTIONS, find_nearest_event, read_recorded_events, write_html_report
+from rare_envs.study.html_report import find_nearest_event, read_recorded_events, write_html_report
 from rare_envs.study.html_report.figures import FigureOfPage
 from tests.rare_envs.study.conftest import write_base
 
@@ -33,6 +33,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path / "run"
 
 
+SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
+"""Ids of the sections of the page, in their order."""
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 
 

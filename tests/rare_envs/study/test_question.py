@@ -30,15 +30,6 @@ class Idle:
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         return np.ones(len(observation), int), None
 """
-RESTLESS = """
-import egos_here
-import numpy as np
-
-def make():
-    ego = egos_here.Ego()
-    ego.choose = lambda observation: np.random.uniform(-1, 1, (len(observation), 2))
-    return ego
-"""
 STRICT = """
 import numpy as np, egos_here
 
@@ -79,9 +70,8 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
 
 
 def test_an_ego_that_answers_differently_each_time_is_noticed(cli: Cli, here: Path) -> None:
-    (here / "restless.py").write_text(RESTLESS)
     words = (*SMALL[:-1], 50, "--json", "--gamma", 5, "--ego")
-    for ego in ("restless:make", "noisy:restless:make"):
+    for ego in ("egos_here:restless", "noisy:egos_here:restless"):
         found = json.loads(cli(*words, ego).stdout)
         assert "failures may not replay" in found["given"] and found["n_failures"] > 0 and found["kinds"] == {}
         assert "cannot be seen again" in " ".join(found["notes"])
