@@ -258,10 +258,6 @@ class _Task:
     begun: float = 0.0
     job: Any = None
 
-    def take_apart(self) -> list[_Task]:
-        """Return its rows as tasks: an attempt that costs a process is dear, and many at once are not."""
-        return [_Task((*self.index, number), row, self) for number, row in enumerate(self.chunk.split(1))]
-
     def put(self, result: Result) -> tuple[int, Result] | None:
         """Take a result; return it with the number of the chunk where the whole chunk is done."""
         if self.parent is None:
@@ -309,7 +305,10 @@ class WorkerPool(Pool):
         running: dict[int, _Task] = {}
         try:
             while waiting or running:
-                while waiting and self._idle and self._may_go(waiting[0], running):
+                while waiting and self._idle:
+                    suspects = waiting[0].attempts or any(task.attempts for task in running.values())
+                    if running and suspects and not self._blames:  # neighbours would share its fate: it goes alone
+                        break
                     self._submit(waiting.popleft(), running)
                 for task, ended in self._wait(running):
                     self._idle.append(task.slot)
@@ -329,10 +328,6 @@ class WorkerPool(Pool):
         for pool in self._pools if self._ours else ():
             with suppress(Exception):  # foreign, and perhaps broken
                 pool.shutdown(wait=False)
-
-    def _may_go(self, task: _Task, running: dict[int, _Task]) -> bool:
-        """Return whether a task may be submitted: a suspect goes alone where its neighbours would share its fate."""
-        return self._blames or not running or not (task.attempts or any(each.attempts for each in running.values()))
 
     def _submit(self, task: _Task, running: dict[int, _Task]) -> None:
         """Submit a task, to a new pool if that is broken."""
@@ -429,8 +424,8 @@ class WorkerPool(Pool):
             self.n_retries += 1
             waiting.appendleft(task)
         elif len(task.chunk) > 1:
-            rows = task.take_apart()
-            self.n_retries += len(rows)
+            rows = [_Task((*task.index, number), row, task) for number, row in enumerate(task.chunk.split(1))]
+            self.n_retries += len(rows)  # each alone: an attempt that costs a process is dear, and many at once are not
             waiting.extendleft(reversed(rows))
         elif self._proven:
             return task.put(self._work.lose(task.chunk, str(error)))

@@ -366,17 +366,14 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         return outcomes[0]
     trace = tuple(replace(level, run=i) for i, outcome in enumerate(outcomes) for level in outcome.trace)
     counts = pool_counts(outcomes)
-    if counts is not None:
+    used = outcomes if counts else [each for each in outcomes if each.status is not Status.STOPPED] or outcomes
+    shares = [each.counts[1] / counts[1] if counts and each.counts else 1 / len(used) for each in used]
+    remarks, weights = _collect_texts([each.remarks for each in used]), _share_weights(outcomes, used, shares)
+    if counts:
         hits, n = counts
-        no_outcome = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
+        no_outcome = sum(each.no_outcome_share * each.counts[0] for each in used if each.counts)
         whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
-        shares = [o.counts[1] / n for o in outcomes if o.counts]
-        remarks = _collect_texts([outcome.remarks for outcome in outcomes])
-        weights = _share_weights(outcomes, outcomes, shares)
-        return replace(whole, sample=_merge_samples(outcomes, shares), draw_weights=weights, remarks=remarks)
-    used = [outcome for outcome in outcomes if outcome.status is not Status.STOPPED] or outcomes
-    shares = [1 / len(used)] * len(used)
-    weights = _share_weights(outcomes, used, shares)
+        return replace(whole, sample=_merge_samples(used, shares), draw_weights=weights, remarks=remarks)
     left_out = len(outcomes) - len(used)
     about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
     if len(used) == 1:
@@ -391,7 +388,7 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         cov=combined_cov(used),
         status=status if mean > 0 else Status.NO_HITS,
         warnings=(*_collect_texts([outcome.warnings for outcome in used]), *about, *_warn_of_disagreement(used, p)),
-        remarks=_collect_texts([outcome.remarks for outcome in used]),
+        remarks=remarks,
         trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=_merge_samples(used, shares),

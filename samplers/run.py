@@ -241,7 +241,8 @@ class Run:
         )
         self._seed, self._n_wanted = choose_seed(arguments.seed), int(arguments.replicates)
         self._on_error, n = arguments.on_error, self._n_wanted
-        shares = [None if max_sim is None else max_sim * (i + 1) // n - max_sim * i // n for i in range(n)]
+        most = self._goal.max_sim
+        shares = [None if most is None else most * (i + 1) // n - most * i // n for i in range(n)]
         choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own; by the smallest share
         goal = replace(self._goal, max_sim=shares[0])
         self._choice: Choice = Choice(method) if choose is None else choose(self._inputs, goal)
