@@ -42,8 +42,6 @@ N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first chunk to the largest."""
 F_TOLERANCE = 1e-3
 """Largest difference of f there, as a share of the largest |f|: products of networks round differently by batch."""
-
-
 NAN_REASON = "f is NaN"
 
 Index = tuple[int, ...]

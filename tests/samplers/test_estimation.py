@@ -57,22 +57,6 @@ def test_a_problem_must_look_like_one(problem, expected):
         samplers.estimate(problem)
 
 
-@pytest.mark.parametrize(
-    ("cls", "name", "expected"),
-    [
-        (samplers.AdaptiveSubsetSimulation, "p0", "p0 to be a number between 0 and 0.5"),
-        (samplers.AdaptiveSubsetSimulation, "sigma0", "sigma0 .*Valid: unit, seeds"),
-        (samplers.AdaptiveSubsetSimulation, "n", "n to be a whole number of at least 10"),
-        (samplers.CrossEntropy, "wide_factor", "wide_factor to be a number above 1"),
-        (samplers.CrossEntropy, "family", "family .*Valid: gaussian, mean"),
-    ],
-)
-@pytest.mark.parametrize("value", [True, np.array([0.3, 0.4])], ids=repr)
-def test_settings_of_the_wrong_type_are_refused_by_name(cls, name, expected, value):
-    with pytest.raises(ValueError, match=rf"(Expected|Unknown) {cls.__name__}\.{expected}"):
-        cls(**{name: value})
-
-
 def test_numbers_of_numpy_are_numbers():
     method = samplers.MonteCarlo(n=np.int64(500), batch=np.int32(100))
     result = samplers.estimate(
