@@ -45,7 +45,6 @@ __all__ = [
     "CollisionRate",
     "FurtherEvents",
     "HumanBenchmark",
-    "LogVariance",
     "TotalRate",
     "VarianceShare",
     "describe_human_contacts",
@@ -82,29 +81,6 @@ FEW_EVENTS = 10
 RATE_DRAWS = 200_000
 """Draws for intervals that have no closed form; the ends have an error of about 1 % for an interval of a factor 10."""
 MILLION_KM = 1e6
-
-
-class LogVariance(NamedTuple):
-    """Parts of the variance of log R.
-
-    Example:
-        >>> round(LogVariance(counts=0.01, sampling=0.0, base=2.25, site=0.0).total, 2)
-        2.26
-    """
-
-    counts: float
-    """From the number of counted events."""
-    sampling: float
-    """From the number of simulations."""
-    base: float
-    """From the events that the base distribution was fitted to."""
-    site: float
-    """From the difference between sites."""
-
-    @property
-    def total(self) -> float:
-        """Their sum."""
-        return sum(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,17 +153,21 @@ class CollisionRate:
         return self.probability.determined and self.probability.p > 0
 
     @property
-    def log_variance(self) -> LogVariance:
-        """Parts of the variance of log R; of them the interval is made where p has none of its own."""
+    def log_variance(self) -> dict[str, float]:
+        """Parts of the variance of log R; of them the interval is made where p has none of its own.
+
+        From the number of counted events, the number of simulations, the events that the base was fitted to, and the
+        difference between sites.
+        """
         one = self.probability
         factor = 1.0 if one.quantile is None else (one.quantile / normal_quantile(self.confidence)) ** 2
         spread = 0.0 if one.spread is None else one.spread**2 + one.fit_bias**2
-        return LogVariance(
-            counts=self.frequency.log_sd**2,
-            sampling=factor * one.cov**2,
-            base=factor * spread,
-            site=self.site_log_sd**2,
-        )
+        return {
+            "counts": self.frequency.log_sd**2,
+            "sampling": factor * one.cov**2,
+            "base": factor * spread,
+            "site": self.site_log_sd**2,
+        }
 
     @property
     def interval_per_hour(self) -> RateInterval:
@@ -204,7 +184,8 @@ class CollisionRate:
         """Parts of the variance of log R as shares of it; empty where the rate is not determined."""
         if not self.determined:
             return {}
-        return {name: float(part / self.log_variance.total) for name, part in self.log_variance._asdict().items()}
+        parts = self.log_variance
+        return {name: float(part / sum(parts.values())) for name, part in parts.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -237,13 +218,13 @@ class CollisionRate:
         n, parts, counted = len(base_normal), self.log_variance, self.frequency
         few = counted.count < FEW_EVENTS
         events = rng.gamma(counted.count + 0.5, size=n) if few else np.full(n, float(counted.count))
-        counts = max(parts.counts - 1 / counted.count, 0.0) if few else parts.counts  # few: of the share alone
+        counts = max(parts["counts"] - 1 / counted.count, 0.0) if few else parts["counts"]  # few: of the share alone
         log_events = math.log(counted.share) + np.log(events) + math.sqrt(counts) * rng.standard_normal(n)
-        other = math.sqrt(parts.site) * rng.standard_normal(n)
+        other = math.sqrt(parts["site"]) * rng.standard_normal(n)
         if self.determined:
             (below, above), z = self._log_distances(), normal_quantile(self.confidence)
-            own = parts.sampling + parts.base
-            of_base = parts.base / own if own > 0 else 0.0
+            own = parts["sampling"] + parts["base"]
+            of_base = parts["base"] / own if own > 0 else 0.0
             error = math.sqrt(of_base) * base_normal + math.sqrt(1.0 - of_base) * rng.standard_normal(n)
             log_p = math.log(self.probability.p) + np.where(error < 0, below, above) / z * error + other
         else:
@@ -259,8 +240,8 @@ class CollisionRate:
             low, high = (float(end) for end in np.quantile(drawn, tail_levels(self.confidence)))
             return (low if self.determined else 0.0), high
         parts, events = self.log_variance, scale * counted.count * counted.share
-        most = math.exp(z * math.sqrt(parts.counts))  # p is 1 at most, at any site
-        rest = z * math.sqrt(parts.counts + parts.site)
+        most = math.exp(z * math.sqrt(parts["counts"]))  # p is 1 at most, at any site
+        rest = z * math.sqrt(parts["counts"] + parts["site"])
         if not self.determined:
             return 0.0, events * min(self.probability.upper * math.exp(rest), most)
         below, above = (float(np.exp(np.hypot(distance, rest))) for distance in self._log_distances())
@@ -270,7 +251,7 @@ class CollisionRate:
         """Return how far the ends of the interval of p are below and above log p > -inf."""
         one, parts = self.probability, self.log_variance
         if one.interval is None:
-            half = normal_quantile(self.confidence) * math.sqrt(parts.sampling + parts.base)
+            half = normal_quantile(self.confidence) * math.sqrt(parts["sampling"] + parts["base"])
             return half, half
         low, high = one.interval
         return math.log(one.p / low) if low > 0 else math.inf, math.log(high / one.p)
@@ -375,7 +356,20 @@ class TotalRate:
         c_ij the covariance of the logarithms: the variance of log R_i where i = j, sqrt(b_i b_j) of the bases where
         both were fitted to the same events, else 0.
         """
-        parts = self._variance_parts()
+        parts: dict[tuple[str, str], float] = {}
+        rates = self.determined
+        for rate in rates:
+            weight, variance = rate.per_million_km, rate.log_variance
+            base = weight * math.sqrt(variance["base"])
+            same = [other for other in rates if other is rate or (rate.fitted_to and other.fitted_to == rate.fitted_to)]
+            shared = sum(other.per_million_km * math.sqrt(other.log_variance["base"]) for other in same)
+            for key, part in {
+                ("base", rate.scenario): base * shared,
+                ("site", rate.scenario): weight**2 * variance["site"],
+                ("counts", ""): weight**2 * variance["counts"],
+                ("sampling", ""): weight**2 * variance["sampling"],
+            }.items():
+                parts[key] = parts.get(key, 0.0) + part
         total = sum(parts.values())
         found = [VarianceShare(source, name, float(part / total)) for (source, name), part in parts.items() if part > 0]
         return tuple(sorted(found, key=lambda each: -each.share))
@@ -433,24 +427,6 @@ class TotalRate:
             drawn += rate.draw(exposure, groups[key], rng)
         low, high = np.quantile(drawn, tail_levels(self.confidence))
         return float(low), float(high) + above
-
-    def _variance_parts(self) -> dict[tuple[str, str], float]:
-        """Return R_i^2 times the parts of the variance of log R_i, by source and scenario."""
-        parts: dict[tuple[str, str], float] = {}
-        rates = self.determined
-        for rate in rates:
-            weight, variance = rate.per_million_km, rate.log_variance
-            base = weight * math.sqrt(variance.base)
-            same = [other for other in rates if other is rate or (rate.fitted_to and other.fitted_to == rate.fitted_to)]
-            shared = sum(other.per_million_km * math.sqrt(other.log_variance.base) for other in same)
-            for key, part in {
-                ("base", rate.scenario): base * shared,
-                ("site", rate.scenario): weight**2 * variance.site,
-                ("counts", ""): weight**2 * variance.counts,
-                ("sampling", ""): weight**2 * variance.sampling,
-            }.items():
-                parts[key] = parts.get(key, 0.0) + part
-        return parts
 
 
 # --- human drivers ------------------------------------------------------------------------------

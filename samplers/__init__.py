@@ -3,7 +3,7 @@
 It needs NumPy and SciPy, and nothing about driving. Begin with `estimate`.
 """
 
-from samplers.analysis.base_error import BaseUncertainty, compute_ratio_uncertainty
+from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.curve import Curve
 from samplers.analysis.gate import Pilot, PlannedRun, Verdict, plan_runs
 from samplers.analysis.reweight import FittedBase, Reweighted
@@ -95,7 +95,6 @@ __all__ = [
     "Verdict",
     "as_distribution",
     "compare",
-    "compute_ratio_uncertainty",
     "estimate",
     "get_method",
     "plan_runs",

@@ -62,8 +62,6 @@ MAX_SPREAD = 2.0
 """Standard deviation of log p_b above which the events do not determine p."""
 MIN_REFITS = 2
 """Refits, and clusters of events, from which there is a spread at all."""
-RATIO_CHECK_DRAWS = 16
-"""Draws at which the refits of two estimates are compared."""
 NO_SUMS = RefitSums(np.empty((1, 0)), np.empty((1, 0)))
 """Of no refits."""
 
@@ -252,73 +250,6 @@ def _exp(exponent: float) -> float:
 def read_lineages(estimate: EstimateData) -> float:
     """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
     return math.inf if estimate.sample is None else estimate.sample.lineages
-
-
-def compute_ratio_uncertainty(first: EstimateData, second: EstimateData) -> BaseUncertainty:
-    """Return p_1 / p_2 of two estimates with the interval that the events behind their base distribution allow.
-
-    The two are estimates of their own on the same base distribution, of two egos for example. `samplers.compare`
-    estimates a ratio from the same draws for both, and states this uncertainty too (`Comparison.base_uncertainty`).
-
-    Args:
-        first: Estimate of p_1, on a base distribution with refits.
-        second: Estimate of p_2, on the same base distribution; it may have noise coordinates of its own.
-
-    Raises:
-        ValueError: If a base has no refits or the refits differ, the confidence differs, or an estimate has no failing
-            points.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> result = samplers.estimate(problem, seed=0, max_sim=2000)
-        >>> compute_ratio_uncertainty(result, result)
-        Traceback (most recent call last):
-            ...
-        ValueError: Expected two estimates on the same base distribution with refits, got StandardNormal.
-    """
-    bases = _require_same_refits(first, second)
-    if first.confidence != second.confidence:
-        raise ValueError(
-            f"Expected the same confidence, got {first.confidence:g} and {second.confidence:g}; give both estimates "
-            "one confidence=..."
-        )
-    one, two = (reweight_runs_to_refits(each, base.refits) for each, base in zip((first, second), bases, strict=True))
-    return summarise_refits(
-        first.p / second.p,
-        math.hypot(first.cov, second.cov),
-        first.confidence,
-        bases[0],
-        RefitSums(np.concatenate([one.log_p, two.log_p]), np.concatenate([one.ess, two.ess])),
-        n_sim=sum(each.ensemble_run.n_sim for each in (first, second) if each.ensemble_run is not None),
-        is_ratio=True,
-    )
-
-
-def _require_same_refits(first: EstimateData, second: EstimateData) -> tuple[FittedBase, FittedBase]:
-    """Return the bases of both, or raise a ValueError unless both have the same refits.
-
-    Densities are compared where both have the same coordinates; with noise coordinates of one of them only the number
-    of refits and the events can be.
-    """
-    bases = [find_fitted_base(each.base) for each in (first, second)]
-    for base, each in zip(bases, (first, second), strict=True):
-        if base is None:
-            raise ValueError(
-                f"Expected two estimates on the same base distribution with refits, got {type(each.base).__name__}."
-            )
-    one, two = (base for base in bases if base is not None)
-    x, y = (base.sample(RATIO_CHECK_DRAWS, np.random.default_rng(0)) for base in (one, two))
-    same = (one.fitted_to, one.family, len(one.refits)) == (two.fitted_to, two.family, len(two.refits))
-    if same and x.shape == y.shape:
-        pairs = zip(one.refits, two.refits, strict=True)
-        same = all(np.allclose(a.log_prob(x), b.log_prob(x), rtol=1e-9, atol=1e-9) for a, b in pairs)
-    if not same:
-        raise ValueError(
-            f"Expected two estimates under the same refits, got {len(one.refits)} of {one.fitted_to} ({one.family}) "
-            f"and {len(two.refits)} of {two.fitted_to} ({two.family}), with other densities."
-        )
-    return one, two
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

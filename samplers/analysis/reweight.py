@@ -58,14 +58,6 @@ MIN_FAMILY = 10
 
 
 @runtime_checkable
-class HasLogProb(Protocol):
-    """A distribution whose log density can be evaluated."""
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, d), shape (n,)."""
-
-
-@runtime_checkable
 class FittedBase(Distribution, Protocol):
     """A base distribution that was fitted to events, with its bootstrap refits; without refits it is like any other.
 
@@ -85,7 +77,7 @@ class FittedBase(Distribution, Protocol):
     """
 
     @property
-    def refits(self) -> Sequence[HasLogProb]:
+    def refits(self) -> Sequence[Any]:
         """The same recipe applied to resampled events, R distributions on the same support."""
 
     @property
@@ -204,20 +196,25 @@ def require_base(estimate: EstimateData) -> Distribution:
     return estimate.base
 
 
-def log_density(distribution: HasLogProb, x: FloatArray) -> FloatArray:
+def log_density(distribution: Any, x: FloatArray) -> FloatArray:
     """Return log_prob at x (k, d), shape (k,), or raise a ValueError if it is not one number per point."""
+    if not hasattr(distribution, "log_prob"):
+        raise ValueError(f"Expected a distribution with log_prob, got {distribution!r}.")
+    own = getattr(distribution, "dim", x.shape[1])  # the user's own class
+    if own != x.shape[1]:
+        raise ValueError(f"Expected a distribution in {x.shape[1]} dimensions, got one in {own}.")
     values = np.asarray(distribution.log_prob(x), dtype=np.float64)
     if values.shape != (len(x),):
         raise ValueError(f"Expected log_prob to give one number per point, shape ({len(x)},), got {values.shape}.")
     return values
 
 
-def _log_density_ratios(estimate: EstimateData, new_base: HasLogProb, x: FloatArray) -> FloatArray:
+def _log_density_ratios(estimate: EstimateData, new_base: Any, x: FloatArray) -> FloatArray:
     """Return log(p1 / p0) at the failing points x (k, d), shape (k,), after all checks of the new base."""
     base, dim = require_base(estimate), x.shape[1]
     if len(x) == 0:
         raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
-    _check_dimensions(new_base, dim)
+    new = log_density(new_base, x)
     if hasattr(new_base, "sample"):  # the user's own class
         draws = np.asarray(new_base.sample(SUPPORT_DRAWS, np.random.default_rng(estimate.seed)), dtype=np.float64)
         if draws.shape != (SUPPORT_DRAWS, dim):
@@ -230,16 +227,7 @@ def _log_density_ratios(estimate: EstimateData, new_base: HasLogProb, x: FloatAr
                 f"The old base has no density at {100 * outside:.2g} % of draws from the new one: failures there were "
                 "never drawn. Estimate again with the new base."
             )
-    return _subtract_log_densities(log_density(new_base, x), log_density(base, x), x)
-
-
-def _check_dimensions(new_base: object, dim: int) -> None:
-    """Raise a ValueError unless the new base has a log_prob and, if it has an attribute dim, `dim` dimensions."""
-    if not isinstance(new_base, HasLogProb):
-        raise ValueError(f"Expected a distribution with log_prob, got {new_base!r}.")
-    own = getattr(new_base, "dim", dim)  # the user's own class
-    if own != dim:
-        raise ValueError(f"Expected a distribution in {dim} dimensions, got one in {own}.")
+    return _subtract_log_densities(new, log_density(base, x), x)
 
 
 def _subtract_log_densities(new: FloatArray, old: FloatArray, x: FloatArray) -> FloatArray:
@@ -287,7 +275,6 @@ def check_refits(base: Distribution, dim: int) -> None:
     x = fitted.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0))
     for number, refit in enumerate(fitted.refits, start=1):
         try:
-            _check_dimensions(refit, dim)
             inside = np.isfinite(log_density(refit, x)).all()
             if hasattr(refit, "sample"):  # the user's own class
                 draws = np.asarray(refit.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0)))
@@ -305,7 +292,7 @@ def check_refits(base: Distribution, dim: int) -> None:
         _checked[fitted] = known
 
 
-def refit_log_ratios(estimate: EstimateData, sample: Sample, refits: Sequence[HasLogProb]) -> FloatArray:
+def refit_log_ratios(estimate: EstimateData, sample: Sample, refits: Sequence[Any]) -> FloatArray:
     """Return log(refit_b(x_i) / base(x_i)) at the failing points, shape (R, k); computed once for an estimate."""
     base, x = require_base(estimate), sample.x
     of = (sample, base, refits)
@@ -322,9 +309,7 @@ def refit_log_ratios(estimate: EstimateData, sample: Sample, refits: Sequence[Ha
     return estimate.refit_ratios[0][1]
 
 
-def reweight_to_refits(
-    estimate: EstimateData, refits: Sequence[HasLogProb], parts: FloatArray | None = None
-) -> RefitSums:
+def reweight_to_refits(estimate: EstimateData, refits: Sequence[Any], parts: FloatArray | None = None) -> RefitSums:
     """Return p under each of R refits, p_b = sum of w_i refit_b(x_i) / base(x_i) over the failing points.
 
     As `Estimate.reweight`, without its refusal: refits on few points are counted by the caller, since leaving them out
@@ -361,7 +346,7 @@ def _sum_logarithms(log_terms: FloatArray, units: NDArray[np.intp]) -> tuple[flo
 
 
 def reweight_runs_to_refits(
-    estimate: EstimateData, refits: Sequence[HasLogProb], split: Callable[[FloatArray], FloatArray] | None = None
+    estimate: EstimateData, refits: Sequence[Any], split: Callable[[FloatArray], FloatArray] | None = None
 ) -> RefitSums:
     """Return p under each refit from the run or its further run, whichever has more effective points under that refit.
 

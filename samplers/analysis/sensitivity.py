@@ -44,7 +44,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from samplers.analysis.reweight import HasLogProb, find_fitted_base, log_density, require_base, reweight_to_refits
+from samplers.analysis.reweight import find_fitted_base, log_density, require_base, reweight_to_refits
 from samplers.analysis.weighted import Reported, WeightedFailures, weigh_failures
 from samplers.method import EstimateData
 from samplers.problem import Distribution, FloatArray, needs_library
@@ -85,7 +85,7 @@ class ParametricBase(Protocol):
         is about; none if it is about all.
         """
 
-    def with_parameters(self, values: FloatArray) -> HasLogProb:
+    def with_parameters(self, values: FloatArray) -> Any:
         """Return the same distribution with other values of the parameters, in the order of `parameters()`."""
 
 

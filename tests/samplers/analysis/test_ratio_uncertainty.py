@@ -1,9 +1,7 @@
 """Ratios of two probabilities under refits of one base."""
 
-import functools
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,39 +10,16 @@ from scipy import stats
 import samplers
 from samplers.analysis.base_error import summarise_refits
 from samplers.analysis.reweight import RefitSums
-from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled
+from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal
 
 SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]
 FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
 BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
 
 
-@functools.cache
-def estimates(base=None, betas=(3.0, 3.3), **options):
-    base = BASE if base is None else base
-    return [samplers.estimate(HalfSpace(base, beta), seed=2, max_sim=3000, **options) for beta in betas]
-
-
 def exact_ratios(refits, betas=(3.0, 3.3)):
     one, two = (np.array([stats.norm.sf(b, r.means[0], r.sds[0]) for r in refits]) for b in betas)
     return one / two
-
-
-def test_the_ratio_under_each_refit_is_the_exact_one():
-    found = samplers.compute_ratio_uncertainty(*estimates())
-    assert np.log(found.value_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
-    assert found.value == pytest.approx(exact_ratios([normal()])[0], rel=0.1)
-
-
-def test_the_interval_by_hand():
-    first, second = estimates()
-    found = samplers.compute_ratio_uncertainty(first, second)
-    pairs = zip(first.base_uncertainty.value_refits, second.base_uncertainty.value_refits, strict=True)
-    spread = np.std([math.log(a / b) for a, b in pairs], ddof=1)
-    half = 2.119905 * math.sqrt(spread**2 + first.cov**2 + second.cov**2 + 0.04)
-    ratio = first.p / second.p
-    assert found.interval == pytest.approx((ratio * math.exp(-half), ratio * math.exp(half)), rel=1e-6)
-    assert found.spread == pytest.approx(spread)
 
 
 def test_two_sides_of_one_run():
@@ -53,7 +28,7 @@ def test_two_sides_of_one_run():
     found = samplers.compare(HalfSpace(base, 3.0), HalfSpace(base, 3.3), seed=2, max_sim=6000)
     ratio = found.base_uncertainty
     assert np.log(ratio.value_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
-    assert ratio.value == found.ratio
+    assert ratio.value == found.ratio == pytest.approx(exact_ratios([normal()])[0], rel=0.1)
     assert ratio.interval[0] < found.interval[0] < found.interval[1] < ratio.interval[1]
     whole = found.either.base_uncertainty
     assert math.log(ratio.interval[1] / ratio.interval[0]) < 0.5 * math.log(whole.interval[1] / whole.interval[0])
@@ -111,27 +86,3 @@ def test_ratios_that_the_events_do_not_determine():
     unknown = summarise_refits(2.0, 0.1, 0.95, base, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert unknown.reason.startswith("1 of 30 refits have no density")
     assert math.isnan(unknown.spread)
-
-
-@pytest.mark.parametrize(
-    ("other", "text"),
-    [
-        (lambda: fitted(resampled(38)), "under the same refits"),
-        (lambda: fitted(SHIFTED[:20]), "got 30 of .* and 20 of"),
-        (lambda: fitted(SHIFTED, family="3 components"), r"\(3 components\)"),
-        (normal, "same base distribution with refits, got FirstCoordinate"),
-    ],
-)
-def test_other_refits_are_refused(other, text):
-    first, second = estimates()[0], estimates(other())[1]
-    with pytest.raises(ValueError, match=text):
-        samplers.compute_ratio_uncertainty(first, second)
-
-
-def test_other_confidence_and_no_failures_are_refused():
-    first, second = estimates()
-    with pytest.raises(ValueError, match=r"same confidence, got 0\.95 and 0\.9"):
-        samplers.compute_ratio_uncertainty(first, replace(second, confidence=0.9))
-    nothing = samplers.estimate(HalfSpace(BASE, 9.0), "mc", seed=1, max_sim=100)
-    with pytest.raises(ValueError, match="nothing failed"):
-        samplers.compute_ratio_uncertainty(first, nothing)
