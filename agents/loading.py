@@ -80,32 +80,27 @@ def load_ego(
         spec: "idm"; "human", an attentive human driver; either with other parameters as "idm?time_headway=2&exponent=2"
             (fields of `rare_envs.IDM` and `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
             ego with lidar; "vision", PilotNet on the front camera; "mgail" or "gail", drivers of the traffic,
-            which as egos act by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors`
-            with one of these kinds; a path to a
-            `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
-            (`agents.saved_ego`); a path to an `.onnx` file (see `agents.onnx.OnnxEgo` for its form);
-            `module:function`, a function without arguments that returns an ego (modules in the working directory are
-            found); `tcp://host:port` for an ego in another program (docs/egos.md); or `process:EGO` or `noisy:EGO`.
-            `process:EGO` is any of these files and functions in a process of its own, which is ended and started anew
-            where the ego hangs or dies. `noisy:EGO` is any ego behind the imperfections of a full stack
-            (`agents.imperfect_stack.Stack`).
-        algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
+            by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors` with one of these
+            kinds, to a `.zip` saved by Stable-Baselines3, or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form);
+            "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub; `module:function`, a function without arguments
+            that returns an ego (modules in the working directory are found); `tcp://host:port` for an ego in another
+            program (docs/egos.md); `process:EGO`, any of these files and functions in a process of its own, which is
+            ended and started anew where the ego hangs or dies; `noisy:EGO`, any ego behind the imperfections of a full
+            stack (`agents.imperfect_stack.Stack`).
+        algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
-            a file that needs code of its author's (a policy class of their own, say) is refused, and one to which
-            everybody may write.
-        stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.
+            a file that needs code of its author's is refused, and one to which everybody may write.
+        stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it, such as
+            `<name>_vecnormalize.pkl` or `vecnormalize.pkl`.
 
     Returns:
         "idm" and "human" as they stand, with settings an `IDM` or a `HumanEgo`; a `LearnedEgo`, else an object with
         `predict`. A `.zip` gives a `SavedEgo`, whose `observation_space` and `action_space` are those of the policy.
-        `VecNormalize` statistics saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`,
-        `vecnormalize.pkl`, the same with `vec_normalize`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The spec is none of these. Or the file is not a model of Stable-Baselines3, is no driver, is damaged
-            or is not trusted. Or the function is missing, fails or returns something without `predict`. Or algo or
-            stats is given for something that is no `.zip`.
+        ValueError: The spec is none of these, is damaged, fails or is not trusted; or algo or stats is given for
+            something that is no `.zip`.
 
     Example:
         >>> load_ego("idm")
@@ -279,17 +274,9 @@ def _read_settings(kind: type, query: str) -> dict[str, Any]:
 def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneChangingDriver:
     """Load a driver by its name or from its file.
 
-    Args:
-        name: "mgail" or "gail", which are shipped, and "imitation", which was trained to be an ego; "mgail?rules=0", it
-            without its rules; "idm", the rule-based driver, and "idm+mobil", which changes lanes too; or the path of a
-            file that `save_driver` wrote.
-
-    Returns:
-        A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The name is none of these, or the file is no driver.
+    The names are "mgail" and "gail", which are shipped, and "imitation", which was trained to be an ego;
+    "mgail?rules=0", it without its rules; "idm", the rule-based driver, and "idm+mobil", which changes lanes too. A file
+    is one that `save_driver` wrote. A ValueError says that the name is none of these, or the file no driver.
 
     Example:
         >>> load_driver("gail").name

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from agents.files import report_missing_file
 from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks, open_pickle
-from agents.sb3_archive import build_policy, find_algorithm, read_archive
+from agents.sb3_archive import build_policy, check_space, find_algorithm, read_archive
 from rare_envs.egos.wrappers import UNBOUNDED, WrappedPolicy, find_stacking
 from rare_envs.plugins import one_line
 
@@ -185,6 +185,7 @@ def load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
         statistics = pickle.loads(content) if trust else open_pickle(content)
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"expected VecNormalize, got {type(statistics).__name__}")
+        check_space(statistics.observation_space)
         theirs, ours = statistics.observation_space.shape or (), observation_space.shape or ()
         fits = find_stacking(theirs, ours) is not None
         whole = not fits or _normalises(statistics)

@@ -147,7 +147,7 @@ def build_policy(algorithm: str, header: Mapping[str, Any], weights: bytes, trus
 
     require(isinstance(kind, type) and issubclass(kind, BasePolicy), "its policy_class is no policy")
     for space in between:
-        _check_space(space)
+        check_space(space)
     layers = given.get("net_arch")
     if isinstance(layers, list) and layers and isinstance(layers[0], dict):  # before Stable-Baselines3 1.8
         given = {**given, "net_arch": layers[0]}
@@ -220,11 +220,11 @@ def _bounded_parameters(state: Mapping[str, Tensor]) -> Iterator[None]:
         handle.remove()
 
 
-def _check_space(space: Any, depth: int = 0) -> None:
+def check_space(space: Any, depth: int = 0) -> None:
     """Refuse a space whose parts do not go together, or of which one element would fill the memory."""
     if isinstance(space, spaces.Dict) and depth == 0:
         for part in space.spaces.values():
-            _check_space(part, 1)
+            check_space(part, 1)
         return
     if isinstance(space, spaces.Box):
         good = space.low.shape == space.high.shape == space.shape and space.low.size <= MAX_OBSERVED
