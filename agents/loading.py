@@ -275,8 +275,8 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     """Load a driver by its name or from its file.
 
     The names are "mgail" and "gail", which are shipped, and "imitation", which was trained to be an ego;
-    "mgail?rules=0", it without its rules; "idm", the rule-based driver, and "idm+mobil", which changes lanes too. A file
-    is one that `save_driver` wrote. A ValueError says that the name is none of these, or the file no driver.
+    "mgail?rules=0", it without its rules; "idm", the rule-based driver, and "idm+mobil", which changes lanes too. A
+    file is one that `save_driver` wrote. A ValueError says that the name is none of these, or the file no driver.
 
     Example:
         >>> load_driver("gail").name
