@@ -72,7 +72,7 @@ def read_actions(kind: str, actions: Tensor, batch: int, ignored: Tensor | None 
 def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
     """Return acceleration [m/s^2] and steering angle [rad], (B, 2), of actions (B, 2) in [-1, 1] or indices (B,).
 
-    Rows `ignored` (B,) get 0. On a GPU actions that are not finite become NaN: to raise an error there is to wait.
+    Rows `ignored` (B,) get 0. On a GPU what is not finite becomes NaN: to raise an error there is to wait.
     """
     if ignored is not None and action.shape[:1] == (batch,):
         action = torch.where(ignored.reshape(-1, *[1] * (action.ndim - 1)), torch.zeros_like(action), action)
@@ -148,11 +148,7 @@ def follow_meta_actions(
 
 
 def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
-    """Return the targets after meta-actions, all of one shape.
-
-    Left and right move the target lane by one, if there is such a lane and its middle is within two lane widths of the
-    vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's present speed.
-    """
+    """Return the targets after meta-actions: lanes within two widths, speeds next to the one nearest to the present."""
     edges = constant(road.edges, y)
     aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
     wanted = (aim.lane + aside).clamp(0, road.lanes - 1)
@@ -164,10 +160,7 @@ def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -
 
 
 def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
-    """Return acceleration, (target speed - speed) / 0.6 s [m/s^2], and steering [rad], (...) -> (..., 2).
-
-    Without a limit; `yaw_rate_towards` goes to the middle of the target lane.
-    """
+    """Return acceleration, (target speed - speed) / 0.6 s [m/s^2], and steering to the lane [rad], (..., 2)."""
     acceleration = (constant(tuple(TARGET_SPEEDS), speed)[aim.speed] - speed) / _TAU_SPEED
     edges = constant(road.edges, y)
     if road.reference_line is not None:

@@ -103,8 +103,7 @@ def remaining_duration(share: Tensor) -> Tensor:
 def draw_glances(draws: Tensor) -> Glances:
     """Return the glances of B drivers, a stationary sequence, from standard normal draws (B, `count_glance_draws`).
 
-    Times between glances are exponential, as in the simulations of Rootzen and Zholud ("Tail estimation for
-    window-censored processes", Technometrics 58, 2016).
+    Times between them are exponential (Rootzen and Zholud, "Tail estimation for window-censored processes", 2016).
     """
     share = torch.special.ndtr(draws).clamp(1e-7, 1.0 - 1e-7)
     left = torch.where(share[:, 0] < OFF_ROAD_SHARE, remaining_duration(share[:, 1]), 0.0)[:, None]
@@ -209,10 +208,7 @@ def inverse_tau(percept: Percept, speed: Tensor) -> Tensor:
 
 
 def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) -> Tensor:
-    """Return errors after dt [s]: Ornstein-Uhlenbeck processes of variance 1, exactly, from fresh normal draws.
-
-    dw = -w dt / tau + sqrt(2 / tau) dW, the "Wiener processes" of Treiber, Kesting and Helbing (2006).
-    """
+    """Return errors after dt [s]: exact Ornstein-Uhlenbeck processes of variance 1, from fresh normal draws."""
     kept = math.exp(-dt / correlation) if correlation else 0.0
     return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
 
@@ -220,8 +216,7 @@ def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) ->
 def estimate_leads(percept: Percept, speed: Tensor, errors: Tensor, model: HumanDriverModel) -> Lead:
     """Return gaps and speed differences to V leaders as a driver estimates them, (B, V), with gap inf for others.
 
-    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v with errors w_s and w_v (B, 2). The gap to the second leader
-    is the sum of both net gaps: the bodies in between are not counted.
+    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v with errors w_s and w_v (B, 2); bodies in between are no gap.
     """
     ahead = percept.noticed & (percept.distance >= 0.0)
     way = torch.where(ahead, percept.distance, torch.inf)
@@ -235,10 +230,7 @@ def estimate_leads(percept: Percept, speed: Tensor, errors: Tensor, model: Human
 
 
 def anticipate(lead: Lead, speed: Tensor, acceleration: Tensor, delay: float) -> tuple[Lead, Tensor]:
-    """Return leads (B, V) and own speed (B,) as a driver expects them after its reaction time `delay` [s].
-
-    s' = s - T' dv, dv' = dv, v' = v + T' a: other speeds, and the own acceleration, are taken for constant.
-    """
+    """Return leads (B, V) and own speed (B,) after a delay [s] in which other speeds and the own acceleration stay."""
     expected = lead._replace(gap=lead.gap - delay * lead.closing_speed)
     return expected, (speed + delay * acceleration).clamp(min=0.0)
 
@@ -246,8 +238,7 @@ def anticipate(lead: Lead, speed: Tensor, acceleration: Tensor, delay: float) ->
 def respond(lead: Lead, speed: Tensor, model: HumanDriverModel) -> Tensor:
     """Return the acceleration that a driver chooses behind V leads (B, V) as it expects them [m/s^2], (B,).
 
-    The IDM with the interactions (s*/s_j)^2 of n leaders, weighted by 1 / sum_j j^-2 so that a queue in equilibrium
-    keeps the gaps of the IDM.
+    (s*/s_j)^2 of n leaders are weighted by 1 / sum_j j^-2: a queue in equilibrium keeps the gaps of the IDM.
     """
     ratio = speed / model.idm.desired_speed
     each = model.idm.interaction(speed[:, None], ratio[:, None], lead)

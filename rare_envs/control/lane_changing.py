@@ -51,18 +51,14 @@ def acceleration_behind(traffic: LaneTraffic, idm: IDM, follower: Tensor, lead: 
 class LaneChangingDriver:
     """IDM along the road, MOBIL for the lane, and the lane keeping of `rare_envs.control.idm` towards it.
 
-    Vehicles decide once in `delay`, each in a phase of its own that follows from its place when it is first
-    driven, as in HighwayEnv. A change under way is not reconsidered until it ends (the centre is within `SETTLED` of
-    the middle of the target lane) or becomes unsafe by MOBIL's criterion of safety while the centre is still in the old
-    lane: then the vehicle goes back. HighwayEnv's changes end when the centre crosses the line, and are taken back
-    when somebody else ahead and too near moves to the same lane.
+    Vehicles decide once in `delay`, each in a phase of its own that follows from its place at first, as in HighwayEnv.
+    A change under way is not reconsidered until it ends or becomes unsafe while the centre is still in the old lane:
+    then the vehicle goes back. Along the road it follows the nearest ahead in its lane, in its target lane, and in its
+    way (bodies overlap across the road), whichever asks for more braking; while changing it counts in both lanes.
 
-    Along the road a vehicle follows the nearest ahead in its lane, in its target lane, and in its way (bodies overlap
-    across the road), whichever asks for more braking. A vehicle that is changing counts in both lanes, so others make
-    room as for one that signals. HighwayEnv's `IDMVehicle` has politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2
-    of braking imposed, a reach of 1 m and no safety of its own, and takes the right one of two lanes that are worth it.
-
-    Nothing is random, and nothing of it is part of x: there are no weights and no noise. Decisions jump, so f does too.
+    HighwayEnv's `IDMVehicle` has politeness 0, a threshold of 0.2 m/s^2, at most 2 m/s^2 of braking imposed, a reach of
+    1 m and no safety of its own, and takes the right one of two lanes that are worth it. Nothing is random, and nothing
+    of it is part of x. Decisions jump, so f does too.
     """
 
     idm: IDM = field(default_factory=IDM)

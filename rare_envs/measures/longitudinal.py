@@ -76,9 +76,8 @@ def time_to_edge(moment: Moment) -> Tensor:
 def lidar_ttc(moment: Moment) -> Tensor:
     """Return the least time to collision along the ego's lidar beams: range / closing speed, at most 10 s, (B,).
 
-    The beams start at the ego's centre, so at contact about 1 m is left at the side and 2.5 m ahead: small values come
-    with violent contacts, side-swipes above all. A collision is worth no more than the moments before it. In the code
-    of O'Kelly et al. (2018, appendix A) beams that meet nothing and those that do not close count as infinite.
+    Beams start at the ego's centre: at contact 1 m is left at the side and 2.5 m ahead. In the code of O'Kelly et al.
+    (2018, appendix A) beams that meet nothing and those that do not close count as infinite.
     """
     return _beam_times(moment).amin(dim=1).clamp(max=TTC_MAX)
 
@@ -124,8 +123,8 @@ def mttc(moment: Moment) -> Tensor:
 def thw(moment: Moment) -> Tensor:
     """Return the time headway, gap / speed, in (0, 10] s: until the ego is where its lead's rear bumper is now.
 
-    SAE J2944 calls this the time gap. 2 s is taught to drivers, under 0.9 s is fined in Germany (Vogel, "A comparison
-    of headway and time to collision as safety indicators", 2003).
+    SAE J2944 calls it the time gap. 2 s is taught, under 0.9 s is fined in Germany (Vogel, "A comparison of headway and
+    time to collision as safety indicators", 2003).
     """
     return (gap_of(moment) / moment.state.speed[:, 0].clamp(min=STILL)).clamp(max=TTC_MAX)
 

@@ -314,9 +314,9 @@ class TermTracker(EpisodeMeasure):
 def find_order(measure: EpisodeMeasure, collisions: str, gamma: float) -> tuple[Measure | None, float]:
     """Return the measure on whose terms to search for f <= gamma, and the threshold of these terms.
 
-    Where {f <= gamma} is the collision, as at gamma = 0 of times to collision, it is the clearance, which tells near
-    from far where times are capped and does not jump from car to car: between the ego and the others, or between all
-    where `collisions` are "any". Else it is the measure itself; None if that is no least over terms and moments.
+    Where {f <= gamma} is the collision, as at gamma = 0 of times to collision, it is the clearance, between all where
+    `collisions` are "any": it tells near from far where times are capped, and does not jump from car to car. Else the
+    measure itself; None if that is no least over terms and moments.
     """
     if type(measure) is not Measure or measure.adds:
         return None, gamma

@@ -78,14 +78,11 @@ def margin_terms(moment: Moment) -> Tensor:
 def margin(moment: Moment) -> Tensor:
     """Return the uncapped time to contact [s], positive, shape (B,); it also orders vehicles that do not approach.
 
-    Along each of the four axes on which two boxes can be apart, the time in which the gap g closes at the rate c:
-    2 g / (c + sqrt(c^2 + 4 d^2)) with d = `DRIFT`, about g / c where it closes, g / d where it stays, g |c| / d^2 where
-    it opens. The bodies touch only once all gaps are closed: the largest of the four. The least of it over vehicles,
-    and of the time to the edge of the road.
-
-    It rises strictly with gaps and falls strictly with closing speeds, near and far, so levels and gradients go on
-    where times to collision are capped. As a measure a collision comes to the negative speed at which the bodies met,
-    so it goes on past contact too. It is ours: an order for samplers, not a quantity of the literature.
+    Along each of the four axes on which two boxes can be apart, the time in which the gap g closes at the rate c, with
+    d = `DRIFT`: 2 g / (c + sqrt(c^2 + 4 d^2)), about g / c where it closes, g / d where it stays, g |c| / d^2 where it
+    opens. Bodies touch once all gaps are closed: the largest of the four, then the least over vehicles and the time to
+    the edge. It is ours, an order for samplers: it rises with gaps and falls with closing speeds where others are
+    capped, and a collision comes to the negative speed at which the bodies met.
     """
     return margin_terms(moment).amin(1)
 
@@ -102,10 +99,7 @@ def name_pairs(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def find_vehicle_or_edge(moment: Moment) -> Tensor:
-    """Return the number of the vehicle, from 0, that is nearest to the ego, and N - 1 where it has left the road, (B,).
-
-    An ego that overlaps a vehicle has hit that vehicle, wherever it is.
-    """
+    """Return the number of the vehicle nearest to the ego, from 0, or N - 1 if it left the road and hit none, (B,)."""
     apart = ~overlaps(moment.state, moment.road).any(1)
     off = apart & moment.road.off_road(moment.state.y[:, 0])
     return torch.where(off, moment.state.x.shape[1] - 1, distances(moment).argmin(1))
@@ -131,11 +125,10 @@ PET_MIN = 1e-3
 def pet(trace: Trace) -> Tensor:
     """Return the post-encroachment time [s]: the least time between one body leaving a place and another taking it.
 
-    The place is ground that the bodies of the ego and of another vehicle both cover in the course of the episode,
-    either of them first. For every delay the ego's body is compared with where the other was (or will be) that much
-    earlier (or later), at all moments and on the straight ways between them. The least delay with an overlap is found
-    to a fraction of a tick, from how far apart the bodies were one tick of delay sooner. In (0, PET_MAX], shape (B,)
-    (Allen, Shin and Cooper, "Analysis of traffic conflicts and collisions", 1978); under 1 s is a serious conflict.
+    For every delay the ego's body is compared with where the others were (or will be) that much earlier (or later), at
+    all moments and on the straight ways between them; the least delay with an overlap is found to a fraction of a tick,
+    from how far apart the bodies were one tick sooner. In (0, PET_MAX], shape (B,) (Allen, Shin and Cooper, "Analysis
+    of traffic conflicts and collisions", 1978); under 1 s is a serious conflict.
     """
     x, y, heading = trace.road.to_world(trace.state.x, trace.state.y, trace.state.heading)
     pet = torch.full_like(x[0, :, 0], PET_MAX)
@@ -161,10 +154,7 @@ def pet(trace: Trace) -> Tensor:
 
 
 def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> Tensor:
-    """Return how far apart bodies are at a delay [m], the ego second and the ego first; `NEAR` where not driven.
-
-    Of each moment the least since the moment before: for one delay both bodies move on together.
-    """
+    """Return how far apart bodies are at a delay [m], the ego second and first, the least since the last moment."""
     early, late = slice(0, len(x) - delay), slice(delay, len(x))
 
     def between(one: slice, other: slice) -> Tensor:
@@ -185,10 +175,7 @@ def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> 
 
 
 def _least_between(before: Tensor, now: Tensor) -> Tensor:
-    """Return the least separation on the straight ways between two poses (4, K), shape (K,), by ternary search.
-
-    The separation is a convex function of the time, so of two inner points the one that is further apart is left out.
-    """
+    """Return the least separation on the straight ways between two poses (4, K), (K,): convex, by ternary search."""
     low, high = torch.zeros_like(now[0]), torch.ones_like(now[0])
     apart = torch.full_like(low, NEAR)
     for _ in range(TERNARY_STEPS):
@@ -236,8 +223,7 @@ def rss_margins(moment: Moment, rss: RSS) -> tuple[Tensor, Tensor]:
     lateral speeds of the left and the right vehicle, positive to the right, v1' = v1 + a rho and v2' = v2 - a rho. The
     squares are ways towards the other: 0 here for a vehicle that still moves away after its response.
 
-    Distances are those between boxes that are not turned. Vehicles that are level along the road (across it) have no
-    distance there; who is ahead (on the right) is told by centres.
+    Boxes are not turned; vehicles that are level have no distance there; who is ahead (on the right) centres tell.
     """
     state = moment.state
     dx, dy = state.x[:, 1:] - state.x[:, :1], state.y[:, 1:] - state.y[:, :1]

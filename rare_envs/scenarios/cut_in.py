@@ -27,10 +27,8 @@ CUTTER_IDM = IDM()
 def initial(x: Tensor) -> State:
     """Place ego and lead in one lane and the cutter beside them.
 
-    Columns of x: ego_speed, cut_in_speed, lead_speed [m/s], cut_in_gap (ego to cutter), lead_gap (cutter to lead),
-    lateral_offset [m] and, of `CutIn-v1`, duration [s]. Vehicles: 0 ego, 1 cutter, 2 lead. Columns of theta: start of
-    the cutter's path [m], its length (the cutter's way in its duration at its initial speed) [m], lateral offset [m],
-    the cutter's desired speed [m/s].
+    x is as in `CUT_IN`, and in `CutIn-v1` the duration [s] behind it. Columns of theta: start of the cutter's path [m],
+    its length (its way in the duration at its initial speed) [m], lateral offset [m], the cutter's desired speed [m/s].
     """
     ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset, *durations = x.unbind(dim=1)
     duration = durations[0] if durations else CUT_IN_DURATION
@@ -48,10 +46,9 @@ def initial(x: Tensor) -> State:
 
 
 def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Return y [m] and slope dy/dx of the cubic Bezier from (0, offset) to (length, 0), level at both ends, (B,) each.
+    """Return y [m] and slope of the cubic Bezier from (0, offset) to (length, 0), level at both ends, (B,) each.
 
-    Its inner control points are at thirds: with t = progress / length, y = offset (1 - 3 t^2 + 2 t^3), before and after
-    it straight on.
+    With t = progress / length, y = offset (1 - 3 t^2 + 2 t^3); before and after it straight on.
     """
     one, two, three, six = scalars((1.0, 2.0, 3.0, 6.0), progress)
     t = (progress / length).clamp(0.0, 1.0)
@@ -63,8 +60,7 @@ def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Te
 def others(state: State, dt: float) -> Others:
     """Move the lead at its speed and the cutter on its path, with IDM's acceleration behind the lead.
 
-    The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
-    IDM). Ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
+    Tian et al.'s code steers along a Bezier of 30 m by pure pursuit, with the ego's IDM; here it is on the curve.
     """
     (x, _, heading, speed), (lead_x, _, _, lead_speed) = state.vehicles[1:]
     tick, body = scalars((dt, VEHICLE_LENGTH), x)

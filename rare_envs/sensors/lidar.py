@@ -72,9 +72,8 @@ def beam_angles(like: Tensor) -> Tensor:
 def sense(bodies: Bodies, observers: int | None = None) -> tuple[Tensor, Tensor]:
     """Return ranges [m] and rates [m/s] of the lidars of the first M of V vehicles (of all for None), (B, M, 20).
 
-    A range is the distance to the nearest body along a beam, at most `MAX_RANGE`, a rate its velocity less the
-    observer's along the beam, negative while closing. Both are differentiable. Vehicles that are not there are parked
-    further than `MAX_RANGE` from all others.
+    To the nearest body along a beam, at most `MAX_RANGE`, and its velocity less the observer's; differentiable.
+    Vehicles that are not there are parked further than `MAX_RANGE` from all others.
     """
     bodies = Bodies(*(field.expand_as(bodies.x) for field in bodies))
     m = bodies.x.shape[1] if observers is None else observers

@@ -156,11 +156,9 @@ Cover = tuple[Tensor, Tensor, Tensor]
 
 
 def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
-    """Return what covers the pixels' footprints on the ground.
+    """Return what covers the pixels' footprints on the ground: strips as wide as t changes over a pixel.
 
-    A pixel sees a strip across the road as wide as the change of t over the pixel, in which a line covers its overlap;
-    so far lines fade rather than flicker. The left edge is a yellow line, the right edge a white one, the lines between
-    lanes are white dashes (MUTCD: a carriageway of one direction).
+    The left edge is a yellow line, the right edge a white one, the lines between lanes are white dashes (MUTCD).
     """
     (s0, s1, s2), (t0, t1, t2) = lines.s, lines.t
     t = torch.addcmul(t1, t2, seen.right).mul_(seen.right).add_(t0)
@@ -460,8 +458,7 @@ BYTES_MEAN, BYTES_DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
 def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
     """Return the noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1.
 
-    A 32-bit hash of key, tick, viewer and pixel gives four bytes; their sum, centred and scaled, is nearly normal (the
-    Irwin-Hall distribution of four terms, which ends at 3.5 standard deviations). Nothing is random but the key.
+    A 32-bit hash of key, tick, viewer and pixel gives four bytes; their sum is nearly normal (Irwin-Hall).
     """
     key = context.weather.key.to(torch.int32)
     for number in (context.tick, torch.full_like(context.tick, context.viewer)):

@@ -90,10 +90,9 @@ def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
 
 
 def crash_of(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
-    """Return the crash of the ego in each of B scenarios at the moment in which it happened.
+    """Return the crash of the ego in each of B scenarios at its moment; ways of the tick from `before`, or by speeds.
 
-    With the first vehicle that it touched, or with the edge of the road where it overlaps none and is off the road. The
-    ways of the tick are known from `before`, the traffic one tick earlier; None goes by speeds and headings.
+    With the first vehicle that it touched, or with the edge of the road where it overlaps none and is off the road.
     """
     crash = _pair_crash(state, road, before, dt, "ego")
     off = (crash.kind == NONE) & road.off_road(state.y[:, 0])

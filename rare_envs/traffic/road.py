@@ -139,11 +139,10 @@ def _nodes(curve: ReferenceLine) -> tuple[float, NDArray[np.float64], NDArray[np
 
 @cache  # never forgotten: recorded rollouts read it where it is
 def _table(curve: ReferenceLine, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
-    """Return coefficients, shape (cells, 11), and the length of a cell [m].
+    """Return coefficients of the cells, straights before and after included, (cells, 11), and the length of a cell [m].
 
     With heading h, curvature k and its slope c at the start of a cell, the curve goes u = s - k^2 s^3 / 6 along h and
-    w = k s^2 / 2 + c s^3 / 6 to the right of it. Columns: coefficients of x, of y, then h, k and c. The first cell is
-    the straight before the curve, the last the one after it.
+    w = k s^2 / 2 + c s^3 / 6 to the right of it. Columns: four coefficients of x, of y, then h, k and c.
     """
     step, k, h = _nodes(curve)
     c = np.diff(k) / step

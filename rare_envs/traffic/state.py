@@ -160,10 +160,7 @@ def bicycle(
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
-    """Return the steering angle [rad] with which `bicycle` turns at a yaw rate [rad/s] and speed [m/s], any shape.
-
-    Inverts yaw rate = v sin(beta) / (l / 2); a vehicle too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
-    """
+    """Return the steering angle [rad] for a yaw rate [rad/s] at a speed [m/s], within its limit: inverts `bicycle`."""
     sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
     slip = torch.asin(sine.clamp(-MAX_SLIP_SINE, MAX_SLIP_SINE))
     return torch.atan(2.0 * torch.tan(slip)).clamp(-STEERING_LIMIT, STEERING_LIMIT)
