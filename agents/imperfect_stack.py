@@ -157,7 +157,7 @@ class NoisyDriver:
 
     @property
     def noise_columns(self) -> int:
-        """Number of columns of x that are its noise, the last ones."""
+        """Number of columns of x that are its noise."""
         return self.stack.noise_columns(self.world)
 
     @property

@@ -206,8 +206,7 @@ class LearnedDriver:
 class LearnedEgo:
     """A learned driver as ego: a Driver that acts by its mean actions and has no memory.
 
-    Simulations call `act`, whatever the environment observes. `predict` is for those who step an environment
-    themselves, made with `observation="lidar"`.
+    Simulations call `act`, whatever the environment observes; `predict` is for the observation "lidar".
 
     Example:
         >>> from agents import load_ego
@@ -318,8 +317,7 @@ class RuleDriver:
 def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathLike[str]) -> Path:
     """Write a driver to one file; an interrupted call leaves no partial file.
 
-    The path, which is returned, ends with .safetensors. A ValueError says that it does not, or that something is NaN or
-    infinite.
+    The path, which is returned, ends with .safetensors. A ValueError says that it does not, or of NaN and infinity.
 
     Example:
         >>> import tempfile
@@ -353,8 +351,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not a safetensors file, lacks something, has a tensor of the wrong shape or type, or was made
-            for other features; the message says which.
+        ValueError: It is damaged, or was made for another form; the message says which.
 
     Example:
         >>> from importlib import resources

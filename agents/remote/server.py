@@ -1,9 +1,6 @@
 """Server of an ego: a request in, an answer out, over ZeroMQ. See docs/egos.md.
 
-    python -m agents.remote.server ADDRESS ARGUMENTS
-
-is the program of the process in which `process:EGO` answers: it connects to ADDRESS; ARGUMENTS are those of
-`agents.load_ego` as JSON.
+`python -m agents.remote.server ADDRESS ARGUMENTS`, those of `agents.load_ego` as JSON, answers for `process:EGO`.
 """
 
 from __future__ import annotations
