@@ -86,11 +86,7 @@ class SubspaceGaussian:
         return np.asarray(xi + (self.mean + np.sqrt(self.variance) * t - t) @ self.axes.T)
 
     def temper(self, power: float) -> "SubspaceGaussian":
-        """Return q^power phi^(1 - power), normalised: nearer to the origin and wider.
-
-        With a noisy f, where points fail with probability pi, failures have density q ~ phi pi and the best
-        proposal is phi sqrt(pi): the tempered one with power 1/2.
-        """
+        """Return q^power phi^(1 - power), normalised; power 1/2 is best for q ~ phi P[fail]."""
         precision = power / self.variance + (1 - power)
         return SubspaceGaussian(self.axes, power * self.mean / self.variance / precision, 1 / precision)
 
@@ -275,11 +271,7 @@ class VonMisesFisherNakagami:
 
     @classmethod
     def fit(cls, u: FloatArray, weights: FloatArray) -> "VonMisesFisherNakagami":
-        """Fit to points u (n, d) with weights (n,): matched mean direction, E[r^2] and E[r^4].
-
-        The squared length of the mean direction is on average 1 / n too large (for one without any; n the
-        effective number of points), which in many dimensions would be a concentration of its own: it is taken off.
-        """
+        """Fit mean direction, less its length by chance, E[r^2] and E[r^4] of u (n, d) with weights (n,)."""
         weights = weights / weights.sum()
         dim, radius = u.shape[1], np.linalg.norm(u, axis=1)
         resultant = weights @ (u / radius[:, None])
@@ -326,11 +318,7 @@ class VonMisesFisherNakagami:
 
 
 def log_normaliser(kappa: float, dim: int) -> float:
-    """Return the logarithm of the von Mises-Fisher density's factor before exp(kappa mu' a).
-
-    log kappa^v - log (2 pi)^(v + 1) - log I_v(kappa) with v = d / 2 - 1; for large orders, where I_v
-    underflows, by its uniform asymptotic expansion.
-    """
+    """Return log kappa^v - log (2 pi)^(v + 1) - log I_v(kappa), v = d / 2 - 1, of the density."""
     v = dim / 2 - 1
     if v < LARGE_ORDER:
         log_bessel = math.log(float(ive(v, kappa))) + kappa
@@ -347,10 +335,8 @@ def shrink_covariance(
 ) -> tuple[FloatArray, float]:
     """Return the covariance S (d, d) drawn towards T = I + (along - 1) v v', and the share of T.
 
-    T is the covariance of N(0, I) beyond a plane with normal v (d,), the direction of the mean. Its share is the
-    expected square error of S, which n independent points are worth, over the square distance between S and T (Ledoit
-    and Wolf), but at least that of (d + 1) / 2 points, counted beside n of S: T where n is small for d, S where n is
-    large.
+    T is that of N(0, I) beyond a plane with normal v (d,). Its share is the expected square error of S, of n points,
+    over the square distance of S and T (Ledoit and Wolf), at least that of (d + 1) / 2 points beside n.
     """
     dim = len(direction)
     target = np.eye(dim) + (along - 1) * np.outer(direction, direction)
@@ -361,11 +347,7 @@ def shrink_covariance(
 
 
 def start_from_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
-    """Return to which of k distant centres each of the points x (n, d) is nearest, as zeros and ones (k, n).
-
-    Centres are points, each drawn with a probability proportional to weight times squared distance from those before
-    (k-means++). There are fewer where the points with a weight have fewer distinct places.
-    """
+    """Return to which of at most k distant centres (k-means++) each of x (n, d) is nearest, as 0 and 1 (k, n)."""
     odds, distances, nearest = weights, list[FloatArray](), np.full(len(x), np.inf)
     while len(distances) < k and odds.sum() > 0:
         centre = x[int(rng.choice(len(x), p=odds / odds.sum()))]
@@ -386,11 +368,9 @@ def expectation_maximisation(
     max_steps: int,
     least_gain: Callable[[float], float],
 ) -> tuple[MixtureT, float]:
-    """Return the mixture reached from some responsibilities (k, n), and its weighted log likelihood.
+    """Return the mixture reached from some responsibilities (k, n) of points with weights (n,), and its log likelihood.
 
-    `maximise` returns the likeliest mixture (M-step) given how far each component explains each point, (k, n); it may
-    drop components. `log_terms` returns log(weight_j q_j) of a mixture at the points, (k, n), which have weights (n,).
-    There are `max_steps` M-steps at most; `least_gain` of the log likelihood is the rise of it with which to go on.
+    `maximise` (M-step) may drop components, `log_terms` has shape (k, n); it ends where a step gains < `least_gain`.
     """
     reached = -np.inf
     for _ in range(max_steps):

@@ -184,11 +184,7 @@ LARGEST_ERROR = 0.02
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OpenTurnsDistribution(DrawnByItsMap):
-    """A continuous distribution of OpenTURNS, or a copula, which is one with uniform marginals.
-
-    Refused are those whose iso-probabilistic transformation leads elsewhere than to N(0, I) (multivariate Student), or
-    does not have their density (Dirichlet in OpenTURNS 1.27).
-    """
+    """A continuous distribution or copula of OpenTURNS; refused where its transformation does not lead to N(0, I)."""
 
     distribution: Any
 
@@ -344,9 +340,7 @@ MAX_CORRELATED = 1000
 def find_base_fault(base: Any, dim: int, n: int = N_DRAWS) -> str | None:
     """Return what does not fit together in a base distribution of d coordinates, in words; None if nothing is seen.
 
-    n draws must have a density, `to_standard_normal` must map them to independent standard normal coordinates and
-    `from_standard_normal` back. A base whose map is not implemented, which plain Monte Carlo does not need, has only
-    its draws looked at.
+    If its map is not implemented, which plain Monte Carlo does not need, only n draws and their density are looked at.
     """
     x = np.asarray(base.sample(n, np.random.default_rng(0)), dtype=np.float64)
     if x.shape != (n, dim):

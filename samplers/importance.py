@@ -59,11 +59,7 @@ class Calibration(NamedTuple):
     strata: NDArray[np.int64]  # of each draw, (n,)
 
     def residuals(self, y: FloatArray) -> FloatArray:
-        """Return y (n,) less what the controls explain of how it deviates from its mean in each stratum, shape (n,).
-
-        The variance of p is that of these in place of y. Each deviation is divided by 1 less the leverage of its draw,
-        as in the jackknife, for a regression follows the draws that it is fitted to.
-        """
+        """Return y (n,) less what the controls explain, by leverage as in the jackknife: p varies as these."""
         if self.controls.shape[1] == 0:
             return y
         mean = _stratum_means(y[:, None], self.strata)[:, 0]
@@ -72,11 +68,7 @@ class Calibration(NamedTuple):
 
 
 def calibrate(ratios: FloatArray, strata: NDArray[np.int64], draws_per_control: int) -> Calibration:
-    """Return calibrated weights of draws from a mixture q; those of fewer draws for each control stay as they are.
-
-    `ratios` (n, m) is h, densities of mass 1 over q at each draw: its components, or mixtures of some of them. `strata`
-    (n,) is the component that each draw is from.
-    """
+    """Return calibrated weights of draws from q, given h (n, m), densities over q; few keep their own."""
     n, m = ratios.shape
     if n < draws_per_control * m:
         none = np.empty((n, 0))
@@ -104,10 +96,9 @@ LARGE_SHARE = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """n independent draws from one proposal, of which k fail; p rests on these.
+    """n independent draws from one proposal, of which k fail; `log_weights` are log(p0 / q), calibrated or not.
 
-    `log_weights` are log(p0 / q), calibrated or not. `fails` says which draws fail, in the order in which they were
-    simulated, (n,); empty where that is not known.
+    `fails` says which draws fail, in the order in which they were simulated, (n,); empty where that is not known.
     """
 
     n: int
@@ -202,11 +193,7 @@ class Draws:
 
 
 def weighted_cov(n: int, log_weights: FloatArray) -> float:
-    """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights; inf without one.
-
-    Standard error of the mean, with (largest term / n)^2 added to its square: where one weight dominates, the sample
-    variance alone is too small most of the time.
-    """
+    """Return the c.o.v. of sum(w) / n, (largest term / n)^2 added to its square; inf without a weight."""
     if log_weights.size == 0:
         return math.inf
     w = np.exp(log_weights - log_weights.max())
@@ -218,13 +205,10 @@ def weighted_cov(n: int, log_weights: FloatArray) -> float:
 def weighted_interval(
     draws: Draws, confidence: float, largest_weight: float, cov: float | None = None, ceiling: float = 1.0
 ) -> Interval:
-    """Return the interval of p: log-normal, with t quantiles where few draws carry it.
+    """Return the interval of p: log-normal, with t quantiles for few draws; Clopper-Pearson's for plain ones.
 
-    With an effective number of failing draws under LOW_ESS its upper end is at least the one
-    that `bernstein_bound` guarantees, or `ceiling` where that is less.
-
-    Without a failing draw p <= largest_weight P_q[failure] gives a one-sided interval. Where all
-    weights are 1 the draws are plain Monte Carlo and the interval is Clopper-Pearson's.
+    Below LOW_ESS its upper end is at least `bernstein_bound`, or `ceiling` where that is less; without a failing draw
+    p <= largest_weight P_q[failure].
     """
     hits = len(draws.f)
     if hits == 0 or largest_weight == 1.0:
@@ -238,12 +222,7 @@ def weighted_interval(
 
 
 def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> float:
-    """Return an upper bound of p that holds whatever the weights, up to `largest_weight`, do.
-
-    The empirical Bernstein bound of Maurer and Pontil, theorem 4, for the mean of n terms in
-    [0, largest_weight], at the level (1 - confidence) / 2. It is wide (7 / 3 largest_weight / n
-    and more), which is what draws that hardly reach the failures deserve.
-    """
+    """Return the upper end of p by Maurer and Pontil, theorem 4, at the level (1 - confidence) / 2."""
     log_term = math.log(4 / (1 - confidence))
     weights, less = np.exp(draws.log_weights), max(draws.n - 1, 1)
     variance = max(float((weights**2).sum()) - draws.n * draws.p**2, 0.0) / less
@@ -376,11 +355,9 @@ class Search:
         return np.concatenate([one.u[one.f <= self.goal.gamma] for one in self.rounds])
 
     def pool_rounds(self) -> Draws:
-        """Return the draws of the rounds kept as if drawn from the mixture of their proposals.
+        """Return the draws of the rounds kept as if from the mixture of their proposals, weights up to N / n_0.
 
-        The first round being base draws, no weight exceeds N / n_0. Later proposals were fitted to earlier draws, so
-        that this is not unbiased as fresh draws would be: low by 1 to 4 %, by 9 % after two rounds of a mixture with
-        several regions; its interval covers p in 92 to 100 % of runs.
+        These were fitted to earlier draws: p is low by 1 to 4 %, its interval holds in 92 to 100 % of runs.
         """
         n = np.array([len(one.f) for one in self.rounds])
         u, f = (np.concatenate(parts) for parts in zip(*((one.u, one.f) for one in self.rounds), strict=True))
@@ -399,10 +376,7 @@ class Search:
         return [f"The search for a proposal ended{where} before gamma: {why.get(self.status, 'it came no closer')}."]
 
     def mix(self, proposal: Any, base_share: float, wide_share: float = 0.0, wide_factor: float = 1.0) -> Mixture:
-        """Return base_share of the base + wide_share (may be 0) of the proposal widened by a factor + the rest of it.
-
-        Its density is at least base_share of the base, so that no weight exceeds 1 / base_share.
-        """
+        """Return base_share of the base, wide_share of the widened proposal and the rest of the proposal."""
         if wide_share == 0:
             return Mixture(np.array([base_share, 1 - base_share]), [self.base, proposal])
         shares = np.array([base_share, wide_share, 1 - (base_share + wide_share)])
@@ -439,10 +413,7 @@ class Search:
         target_cov: float | None,
         warnings: Sequence[str],
     ) -> Generator[FloatArray, FloatArray, Outcome]:
-        """Simulate the final draws of a sampler with that share of base draws; return what they say of p.
-
-        Where the run was stopped before, the draws of the search are weighted as from the mixture of its proposals.
-        """
+        """Simulate the final draws of a sampler with that base_share; after a stop take those of the search."""
         base_draws = len(self.rounds[0].f) if self.rounds else 0
         draws = yield from self.draw_final(sampler, limit, batch, target_cov)
         if draws.n:

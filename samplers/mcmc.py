@@ -200,10 +200,7 @@ def descend(
     report: Callable[[Growth, NextLevel | Status], None],
     rng: np.random.Generator,
 ) -> Generator[FloatArray, FloatArray, Status]:
-    """Go from level to level until the plan ends the descent or `Interrupted` is thrown in; return how it ended.
-
-    `report` is called with every level, the first one included, as soon as it is known how the descent goes on.
-    """
+    """Go from level to level until the plan ends the descent or it is interrupted; every level is reported once."""
     growth = Growth(first, kernel, False, first.u[:0, 0], first.f[:0, 0])
     depth, n_sim = 0, 0
     while True:
@@ -242,11 +239,7 @@ def multiply_levels(trace: Sequence[Level]) -> tuple[float, float]:
 
 
 def judge_levels(chains: Chains, goal: Goal, trace: Sequence[Level]) -> tuple[float, Interval]:
-    """Return the c.o.v. and the interval of p = prod of the shares in `trace`, after a last level `chains`.
-
-    Where no point of it fails, the level reached is as uncertain as its descent, and its share as if each of its roots
-    were one point.
-    """
+    """Return the c.o.v. and the interval of p, the product of the shares in `trace`, after a last level `chains`."""
     n, confidence = trace[0].n_points, goal.confidence
     roots = chains.where(chains.f <= goal.gamma).roots
     p, cov = multiply_levels(trace)
@@ -262,21 +255,15 @@ def judge_levels(chains: Chains, goal: Goal, trace: Sequence[Level]) -> tuple[fl
 
 
 def effective_roots(roots: NDArray[np.int64]) -> float:
-    """Return how many points of level 0 the failing points (k,) effectively descend from, (sum h)^2 / sum h^2.
-
-    So many independent terms, less one for their mean, are the degrees of freedom of the c.o.v.: as a rule 8 to 15
-    with N = 1000 and p = 2e-4, too few for a normal quantile.
-    """
+    """Return how many points of level 0 those with these roots (k,) effectively come from, (sum h)^2 / sum h^2."""
     h = np.bincount(roots).astype(np.float64)
     return float(h.sum() ** 2 / (h * h).sum())
 
 
 def descent_cov(roots: NDArray[np.int64], n: int) -> float:
-    """Return the c.o.v. of p-hat that the descent of the failing points shows.
+    """Return the c.o.v. of p-hat by the roots (k,) of the failing points, which holds the correlation between levels.
 
-    With h_i of them descending from point i of n at level 0, as `roots` (k,) says, p-hat is proportional to the mean of
-    the h_i. Were the thresholds fixed, these would be independent, so c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n. Unlike
-    the product over levels this holds the correlation between levels: a lucky point at level 0 is lucky at all.
+    With h_i of them from point i of n at level 0: c.o.v.^2 = sum h_i^2 / (sum h_i)^2 - 1/n.
     """
     if roots.size == 0:
         return math.inf

@@ -73,9 +73,7 @@ PRIOR_DIM = 10
 def correct_eigenvalues(values: FloatArray, n: float) -> FloatArray:
     """Return the eigenvalues l (d,) of a covariance of n > d points, increasing, without their bias, by Stein.
 
-    Each is divided by 1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j): small ones change by a factor, where a target
-    of variance 1 would add to them. Failures between two planes have a variance of 0.05 across, which a tenth of I
-    triples.
+    Each is divided by 1 - (d - 1) / n + (2 / n) sum_j l_i / (l_i - l_j).
     """
     gaps = values[:, None] - values
     gaps[gaps == 0] = np.inf  # its own, and equal ones
@@ -95,11 +93,10 @@ def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
 
 
 def move_gaussian(present: Gaussian, u: FloatArray, weights: FloatArray, share: float) -> Gaussian:
-    """Return the Gaussian with the moments of share Q + (1 - share) P, its covariance drawn towards that of P.
+    """Return the Gaussian with the moments of share Q + (1 - share) P, its covariance drawn towards P, the present.
 
-    P is the present Gaussian; Q has the points u (n, d) with weights (n,) that add up to 1. The covariance of P counts
-    as (d + 1) max(1, d / PRIOR_DIM) points beside the effective ones of Q: in many dimensions the noise of the
-    d (d + 1) / 2 entries of a covariance ruins importance weights.
+    Q has points u (n, d) with weights (n,); P counts as (d + 1) max(1, d / PRIOR_DIM) points beside the effective ones
+    of Q: in many dimensions the noise of a covariance ruins importance weights.
     """
     own = present.covariance
     mean = share * (weights @ u) + (1 - share) * present.mean
@@ -124,10 +121,9 @@ LEAST_OF_EVEN_SHARE = 0.5
 def fit_proposal_mixture(
     fit: Fit, u: FloatArray, weights: FloatArray, most: int, size: int, rng: np.random.Generator
 ) -> Mixture:
-    """Return the mixture of 1 to `most` components, fitted to points u (n, d) with weights (n,), with the best BIC.
+    """Return the mixture of 1 to `most` components, fitted to u (n, d) with weights (n,), by the best BIC.
 
-    The criterion counts the effective number of points, (sum w)^2 / sum w^2, and `size` parameters a component. More
-    components are tried for as long as they raise it.
+    The criterion counts the effective number of points, and `size` parameters a component.
     """
     points = 1 / float(weights @ weights)
     best, highest = Mixture(np.ones(1), [fit(u, weights)]), -np.inf

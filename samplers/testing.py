@@ -65,11 +65,7 @@ def check_budget(method: Stepping) -> None:
 
 
 def check_seed(method: Stepping) -> None:
-    """Check that the seed alone decides the result: nothing is drawn from global generators.
-
-    The generators are watched in a run that repeats one made before: a first run may import a library, and some draw
-    while they are imported.
-    """
+    """Check that the seed alone decides the result: nothing is drawn from global generators."""
 
     def state() -> tuple[object, bytes]:
         return random.getstate(), repr(np.random.get_state(legacy=False)).encode()  # noqa: NPY002 (nobody uses it)

@@ -93,11 +93,7 @@ def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
 
 
 class NoiseMarginalisedInputs(DrawnByItsMap):
-    """The coordinates that are not noise, as inputs of their own; points u (n, k) become x (n, d) with noise drawn.
-
-    The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a
-    counter, so that nothing large is kept. The mask `noise` (d,) says which coordinates are noise.
-    """
+    """The coordinates that are not noise, as inputs; u (n, k) becomes x (n, d), equal u with equal noise."""
 
     def __init__(self, inputs: Inputs, noise: NDArray[np.bool_], rng: np.random.Generator) -> None:
         self.dim = int(np.count_nonzero(~noise))
@@ -135,11 +131,7 @@ SimulationSteps = Generator[FloatArray, FloatArray, _T]
 
 
 class Simulator:
-    """The way to f from standard normal space, its count and trace: the only part of a run that is changed in place.
-
-    An `Interrupted` that ends a step midway discards the step's state, not the simulations that it made; so the count
-    stands outside the state. `inputs` are the coordinates that are searched, with the map from u to x.
-    """
+    """The way to f from standard normal space, its count and trace, which stand also where a step is interrupted."""
 
     def __init__(self, inputs: Inputs, goal: Goal | None = None) -> None:
         self.inputs, self.goal = inputs, goal

@@ -32,10 +32,7 @@ def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
 
 
 def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
-    """Return alpha and beta (m, 2) in a box [low, high], 0 < low, with the largest likelihood for statistics (m, 2).
-
-    Maximises (alpha, beta) . statistics - log B(alpha, beta) for each row; these are E[log y] and E[log(1 - y)].
-    """
+    """Return alpha, beta (m, 2) in [low, high] that maximise (alpha, beta) . statistics - log B, row by row."""
 
     def loss(parameters: FloatArray) -> tuple[float, FloatArray]:
         theta = parameters.reshape(statistics.shape)
@@ -50,12 +47,9 @@ def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
 
 
 def project_mean(target: FloatArray, centre: FloatArray, cholesky: FloatArray, radius: float) -> FloatArray:
-    """Return the mean (d,) of the Normal with fixed covariance, in a box around a centre (d,), nearest to some other.
+    """Return mu (d,) with |mu - centre|_inf <= radius and the least |L^-1 (mu - target)|, L = cholesky (d, d).
 
-    Maximises mu' S^-1 m - mu' S^-1 mu / 2 over |mu - centre|_inf <= radius, where m = target (d,) is the distribution's
-    mean and S = L L' the covariance, L = cholesky (d, d). A mean inside the box is its own projection and a diagonal S
-    clips each coordinate; otherwise mu = centre + radius z with the z in [-1, 1]^d that has the smallest
-    |L^-1 (z - (m - centre) / radius)|, by OSQP through cvxpy.
+    A quadratic programme, solved by OSQP through cvxpy, unless the target is in the box or L diagonal.
     """
     clipped = np.clip(target, centre - radius, centre + radius)
     diagonal = np.count_nonzero(cholesky) == len(centre)
@@ -194,10 +188,8 @@ EMPTY = float(np.finfo(np.float64).eps)
 def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatArray, alpha: float) -> Mixture:
     """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than P, the present one.
 
-    Q has the points x (n, d) with weights (n,). Maximises a lower bound of equation 2's objective: the points of Q are
-    shared among the components anew in every step, the mass of P stays with the components that it comes from, so
-    that its share in their moments is exact. A mixture of one component becomes one of k, copies of it, and the points
-    are first shared by k-means; k is less where Q has fewer distinct points or alpha = 1 leaves one empty.
+    Q has the points x (n, d) with weights (n,), shared anew in every step; the mass of P stays with its components.
+    One component becomes k copies, and the points are first shared by k-means.
     """
     if len(present.components) == 1:
         from sklearn.cluster import KMeans  # over a second to import
@@ -399,12 +391,10 @@ class Product(IndependentDistributions):
 
 
 def announced_blocks(inputs: Inputs) -> Product:
-    """Return the base distribution of some inputs as the product of the blocks that it announces.
+    """Return the base distribution of some inputs as the product of the blocks in its attribute `blocks`.
 
-    `inputs.base.blocks` holds one entry per block, in the order of the coordinates: a block, or
-    any object with the attributes alpha, beta, low and high (and box, if that is not the paper's),
-    or with mean and covariance (and radius, if the mean is to stay in a box). A ValueError says that there are no
-    blocks, one is not as described, or their product is not the base distribution.
+    An entry is a block, or has alpha, beta, low, high (and box), or mean and covariance (and radius). A ValueError
+    says what is missing, or that their product is not the base distribution.
     """
     announced = getattr(inputs.base, "blocks", None)  # the user's own class
     if not announced:

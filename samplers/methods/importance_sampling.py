@@ -139,8 +139,7 @@ class ImportanceSampling(Method):
 def unreached_share(search: Search, theta: FloatArray) -> float:
     """Return the share of the search's failing points that the tilt theta (d,) does not reach.
 
-    The larger of two: of the base draws under the first level, those with theta' u < 0; of the mass of the
-    failing draws of all rounds, that with theta' u < |theta|^2 / 2, where the tilted density is under the base one.
+    The larger of: base draws under the first level with theta' u < 0; failing mass with theta' u < |theta|^2 / 2.
     """
     first = search.rounds[0]
     behind = float((first.u[first.f <= search.trace[0].gamma] @ theta < 0).mean())

@@ -170,11 +170,7 @@ def weights_cov(log_weights: FloatArray) -> float:
 
 
 def next_width(g: FloatArray, log_ratio: FloatArray, target: float, low: float, high: float) -> float:
-    """Return the width in [low, high] at which the weights Phi(-g / width) p0 / q have the target c.o.v.
-
-    `low` where they have less at any width, `high`, that of the round before, where they have more; g = f - gamma and
-    log_ratio = log(p0 / q) have shape (n,).
-    """
+    """Return the width in [low, high] at which Phi(-g / width) p0 / q has the target c.o.v., or an end."""
     if weights_cov(log_smooth_indicator(g, low) + log_ratio) <= target:
         return low
     if weights_cov(log_smooth_indicator(g, high) + log_ratio) >= target:

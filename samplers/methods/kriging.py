@@ -100,10 +100,7 @@ class Outcomes(NamedTuple):
 
 
 def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> Kriging:
-    """Fit a process to outcomes y = f - gamma (n,), which may be infinite, at points u (n, d).
-
-    The covariance parameters of `before`, fitted to some of them, are kept unless there are many more points.
-    """
+    """Fit a process to outcomes y = f - gamma (n,), infinite ones too, at u (n, d), after another of fewer."""
     if before is None or len(y) >= REFIT_GROWTH * before.n_searched:
         # a search begins afresh: from the last result it may stay where few points had led it
         kernel, scale, n_searched, search = _initial_kernel(u.shape[1]), outcome_scale(y), len(y), True
@@ -133,9 +130,8 @@ def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> 
 def _find_shift(mean: FloatArray, sd: FloatArray, fails: NDArray[np.bool_]) -> float:
     """Return where in standardised outcomes failure begins, given each point's prediction without it, shape (n,).
 
-    Where f jumps to failure (a time to collision of 0.5 s, then -1), points fail whose prediction is well above 0. The
-    shift has the highest posterior density with P[fail] = Phi((shift - mean) / sd) and
-    a standard normal prior.
+    The highest posterior density with P[fail] = Phi((shift - mean) / sd) and a standard normal prior: where f jumps to
+    failure, points fail whose prediction is well above 0.
     """
     sign = np.where(fails, 1.0, -1.0)
 
@@ -170,10 +166,7 @@ def _initial_kernel(dim: int) -> Any:
 
 
 def _fit_process(kernel: Any, u: FloatArray, z: FloatArray, *, search: bool) -> tuple[Any, FloatArray, float, float]:
-    """Return the process of outcomes z (n,) at u (n, d), which it has with mean 0 and standard deviation 1, and both.
-
-    Its covariance parameters are those of `kernel`, or the likeliest near them for the points next to the limit state.
-    """
+    """Return the process of outcomes z (n,) at u (n, d), these standardised, their mean and standard deviation."""
     from sklearn.gaussian_process import GaussianProcessRegressor
 
     def climb(loss: Any, start: Any, bounds: Any) -> tuple[FloatArray, float]:

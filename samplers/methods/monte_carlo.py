@@ -19,11 +19,7 @@ LEAST_FAILING = 10_000
 
 
 class EvenlySpaced:
-    """Rows 0, s, 2 s, ... of a stream; s is 1 and doubles where more than `most` would be kept.
-
-    Which rows are kept depends on their number alone, so that independent draws stay independent and unselected. The
-    attribute `stride` is s, and n the number of rows seen.
-    """
+    """Rows 0, s, 2 s, ... of a stream, chosen by number alone; s is 1 and doubles beyond `most` rows."""
 
     def __init__(self, most: int, shape: tuple[int, ...] = ()) -> None:
         self.stride, self.n = 1, 0
@@ -69,12 +65,7 @@ class KeptDraws:
         return self._x.n, self._f.n
 
     def outcome(self, goal: Goal, trace: list[Level]) -> Outcome:
-        """Return the outcome of a run that ends with them.
-
-        Where some draws were left out of its sample, those kept stand for them. The weights of the failing ones add up
-        to their share of all draws, so that p is exact; the error of p at other thresholds is that of the draws kept,
-        as the weights and their number tell.
-        """
+        """Return the outcome of a run that ends with them; kept draws stand for all, and their weights make p exact."""
         (hits, n), f, x, failing = self.counts, self._f.values, self._x.values, self._f_failing.values
         if self._f.stride == 1 and self._x.stride == 1:
             sample = Sample.of_equal_draws(f, x)

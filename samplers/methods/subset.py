@@ -130,11 +130,7 @@ def summarise(
 
 
 def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], gamma: float) -> Sample:
-    """Return the points of all levels with their weights.
-
-    A point of level j counts where it lies above the threshold that leads on to level j + 1 (below it, the
-    points of level j + 1 speak), with weight P_j / N_j: the probability of its level over its points.
-    """
+    """Return the points of all levels: of level j those above the next threshold, with weight P_j / N_j."""
     reached = np.cumprod([1.0, *(record.p for record in trace[:-1])])
     weights = reached / [record.n_points for record in trace]
     thresholds = [math.inf, *(record.gamma for record in trace[:-1]), -math.inf]

@@ -153,10 +153,8 @@ class PoolProposal(NamedTuple):
 def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator) -> FloatArray:
     """Choose the next n points to learn from, shape (n, d).
 
-    Candidates are drawn from the pool in proportion to phi sqrt(P[fail] P[safe]). Of these, one after the other, the
-    most doubtful one is taken (least |mean| / sd, the U of Echard, Gayton and Lemaire 2011), and the variances of all
-    are reduced by what its outcome will tell, which needs no outcome: the points of a batch lie apart. The others are
-    drawn at random, where a surrogate that is not believed leaves both open.
+    Of candidates drawn as phi sqrt(P[fail] P[safe]) the most doubtful one by one (least |mean| / sd, Echard et al.
+    2011), each lowering the others' variances; the rest at random where a doubted surrogate leaves both open.
     """
     log_open, most = pool.log_open, 40 * n
     weights = normalise_weights(log_open)
@@ -260,10 +258,9 @@ class SurrogateRun:
         return PoolProposal.build(Pool.draw(kriging, mixture, FINAL_POOL, self.rng)), mixture
 
     def _estimate(self, kriging: Kriging, mixture: Mixture) -> Steps:
-        """Draw until the budget is used or the target is met; p rests on these draws alone, each part's mean unbiased.
+        """Draw until the budget is used or the target is met; p rests on these draws alone.
 
-        The surrogate learns from each part before the next one is drawn. Given what was there before it, each part's
-        mean is unbiased, and so is that of all draws. The c.o.v. holds the error of the last pool, the largest one.
+        The surrogate learns from each part before the next is drawn, which is unbiased given what was before.
         """
         goal, cov, status = self.goal, math.inf, Status.CONVERGED
         draws = Draws(0, np.empty(0), np.empty(0))
@@ -321,11 +318,7 @@ class SurrogateRun:
         return replace(outcome, draw_weights=draws.weights_after(0))
 
     def _outcome(self, draws: Draws, cov: float, largest_weight: float, status: Status) -> Outcome:
-        """Return what weighted draws say of p; no weight exceeds `largest_weight`.
-
-        That they are few is a remark here, no warning: with a few hundred simulations it is the rule, and the interval
-        knows it (12 of the 40 runs in `benchmarks/results/few_simulations.jsonl`, whose intervals all held p).
-        """
+        """Return what weighted draws say of p; that they are few is a remark here, as it is the rule."""
         none, confidence = len(draws.f) == 0, self.goal.confidence
         if draws.ess < LEAST_ESS:
             interval = weighted_interval(draws, confidence, largest_weight, cov)
