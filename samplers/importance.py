@@ -375,8 +375,12 @@ class Search:
         why = {Status.BUDGET: "its share of max_sim was used up", Status.STOPPED: "it was stopped"}
         return [f"The search for a proposal ended{where} before gamma: {why.get(self.status, 'it came no closer')}."]
 
-    def mix(self, proposal: Any, base_share: float, wide_share: float = 0.0, wide_factor: float = 1.0) -> Mixture:
-        """Return base_share of the base, wide_share of the widened proposal and the rest of the proposal."""
+    def mix(
+        self, proposal: Any, base_share: float, wide_share: float = 0.0, wide_factor: float = 1.0
+    ) -> ProposalDistribution:
+        """Return base_share of the base, wide_share of the widened proposal and the rest of it; the base for None."""
+        if proposal is None:
+            return self.base
         if wide_share == 0:
             return Mixture(np.array([base_share, 1 - base_share]), [self.base, proposal])
         shares = np.array([base_share, wide_share, 1 - (base_share + wide_share)])
@@ -407,16 +411,17 @@ class Search:
     def finish(
         self,
         sampler: ProposalDistribution,
-        base_share: float,
-        limit: int,
         batch: int,
-        target_cov: float | None,
         warnings: Sequence[str],
+        limit: int | None = None,
+        target_cov: float | None = None,
     ) -> Generator[FloatArray, FloatArray, Outcome]:
-        """Simulate the final draws of a sampler with that base_share; after a stop take those of the search."""
+        """Simulate the final draws of a sampler that `mix` returned; after a stop take those of the search."""
+        limit = count_final_draws(self.goal, self.n_sim, batch) if limit is None else limit
         base_draws = len(self.rounds[0].f) if self.rounds else 0
-        draws = yield from self.draw_final(sampler, limit, batch, target_cov)
+        draws = yield from self.draw_final(sampler, limit, batch, target_cov or self.goal.target_cov)
         if draws.n:
+            base_share = float(sampler.weights[0]) if isinstance(sampler, Mixture) else 1.0
             made = base_draws + int(base_share * draws.n)
             return draws.outcome(self.goal, self.status, self.trace, 1 / base_share, made, warnings)
         draws = self.pool_rounds()

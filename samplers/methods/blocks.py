@@ -12,7 +12,7 @@ References:
 import math
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -223,9 +223,6 @@ def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatA
     return Mixture(mixture.weights[used] / mixture.weights[used].sum(), components)
 
 
-BlockT = TypeVar("BlockT", bound="_GaussianInBase")
-
-
 @dataclass(frozen=True, eq=False)
 class _GaussianInBase:
     """Common part of the blocks that are Gaussian in the base distribution, N(mean, L L')."""
@@ -257,7 +254,7 @@ class _GaussianInBase:
         """Return mean + L u."""
         return self.gaussian.from_standard_normal(u)
 
-    def widen(self: BlockT, factor: float) -> BlockT:
+    def widen(self, factor: float) -> Any:
         """Return the block with `factor` times the standard deviations."""
         return replace(self, gaussian=self.gaussian.widen(factor))
 

@@ -8,12 +8,11 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from samplers.distributions import Gaussian
-from samplers.importance import Search, count_final_draws
+from samplers.importance import Search
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
 from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs, check_settings, is_number
-from samplers.proposals import ProposalDistribution
 from samplers.sample import Status, next_level, normalise_weights
 
 
@@ -137,13 +136,9 @@ class CrossEntropy(Method):
         ranks = [(first, level.cov) for first, level in zip(firsts, search.trace, strict=True)]
         best = ranks.index(min(ranks)) if ranks else 0
         reached = bool(ranks) and search.trace[best].gamma == goal.gamma
-        sampler: ProposalDistribution = base
-        base_share = 1.0
-        if len(proposals) > 1:  # else the base draws fail often enough, or there is no way on
-            base_share = self.base_share
-            sampler = search.mix(proposals[best], base_share, self.wide_share, self.wide_factor)
-        limit, doubts = count_final_draws(goal, search.n_sim, self.n_final), [] if reached else search.warnings()
-        return (yield from search.finish(sampler, base_share, limit, self.n_final, goal.target_cov, doubts))
+        found = proposals[best] if len(proposals) > 1 else None  # base draws fail often enough, or there is no way on
+        sampler = search.mix(found, self.base_share, self.wide_share, self.wide_factor)
+        return (yield from search.finish(sampler, self.n_final, [] if reached else search.warnings()))
 
     def _start(self, inputs: Inputs) -> Product:
         """Return the base distribution by blocks, theta_0, in the space that the search works in."""

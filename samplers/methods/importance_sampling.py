@@ -97,15 +97,13 @@ class ImportanceSampling(Method):
         search = Search(inputs, goal, rng)
         tilt = yield from self._search(search, inputs.dim)
         missed = unreached_share(search, tilt.mean) if tilt and search.status is not Status.STOPPED else 0.0
-        sampler, base_share, doubts = search.base, 1.0, search.warnings()
+        sampler, doubts = search.mix(tilt, self.base_share), search.warnings()
         if missed > MOST_UNREACHED:
             where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
-            doubts = [f"{where}: draws from the base distribution replace it."]
-        elif tilt:
-            sampler, base_share = search.mix(tilt, self.base_share), self.base_share
+            sampler, doubts = search.base, [f"{where}: draws from the base distribution replace it."]
         target = self.half_width / QUANTILE if goal.target_cov is None else goal.target_cov
         limit = min(goal.budget - search.n_sim, self.n if goal.max_sim is None else goal.max_sim)
-        outcome = yield from search.finish(sampler, base_share, limit, self.batch, target, doubts)
+        outcome = yield from search.finish(sampler, self.batch, doubts, limit, target)
         met = outcome.cov <= target
         if outcome.status is Status.STOPPED:
             return outcome

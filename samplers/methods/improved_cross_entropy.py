@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from samplers.components import VonMisesFisherNakagami
-from samplers.importance import Search, count_final_draws
+from samplers.importance import Search
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, check_settings
@@ -105,13 +105,8 @@ class ImprovedCrossEntropy(Method):
         """Search for a proposal, then estimate with fresh draws."""
         search = Search(inputs, goal, rng)
         proposal = yield from self._search(search)
-        sampler, base_share = search.base, 1.0
-        if proposal is not None:
-            base_share = self.base_share
-            sampler = search.mix(proposal, base_share, self.wide_share, self.wide_factor)
-        limit = count_final_draws(goal, search.n_sim, self.n_final)
-        doubts = search.warnings()
-        return (yield from search.finish(sampler, base_share, limit, self.n_final, goal.target_cov, doubts))
+        sampler = search.mix(proposal, self.base_share, self.wide_share, self.wide_factor)
+        return (yield from search.finish(sampler, self.n_final, search.warnings()))
 
     def _search(self, search: Search) -> Generator[FloatArray, FloatArray, Mixture | None]:
         """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""

@@ -166,7 +166,7 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
         variance = np.array([min(along * (1 - excess) + excess, SUBSPACE.max_spread)])
         raised = inflate_variances(variance, ess)
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
-    centred = (u - mean) * np.sqrt(weights)[:, None]  # `weighted_moments` would lose digits of small variances far out
+    centred = (u - mean) * np.sqrt(weights)[:, None]  # E[u u'] less squares loses digits far out
     shrunk, share = shrink_covariance(centred.T @ centred, v, along, ess)
     values, axes = np.linalg.eigh(shrunk)
     return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess)), share
