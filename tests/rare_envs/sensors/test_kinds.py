@@ -11,7 +11,6 @@ from tests.rare_envs.traffic_states import traffic
 @pytest.mark.parametrize("observation", ["camera+speed", "speed+camera", ("speed", "camera")])
 def test_kinds_have_one_spelling(observation: object) -> None:
     assert read_kinds(observation) == "camera+speed"
-    assert read_kinds(observation) == "camera+speed"
 
 
 @pytest.mark.parametrize("observation", ["", "radar", "camera+", None, ["camera", 3], "lidar+lidar"])
