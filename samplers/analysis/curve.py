@@ -32,87 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class ProbabilityCurve(Kept):
-    """Probabilities over thresholds, with a band that should hold all of them at once; `Curve` and `Exceedance` are.
-
-    A subclass has the thresholds as a further field.
-    """
-
-    p: FloatArray
-    """Estimated probabilities, shape (k,)."""
-    low: FloatArray
-    """Lower end of the band, shape (k,)."""
-    high: FloatArray
-    """Upper end of the band, shape (k,)."""
-    cov: FloatArray
-    """Coefficient of variation of each `p`, shape (k,)."""
-    ess: FloatArray
-    """Effective number of independent units (draws, paths) behind each `p`, shape (k,)."""
-    confidence: float
-    """Nominal probability that the band holds the truth at all k thresholds together."""
-
-    axis: ClassVar[str]
-    """Name of the field that has the thresholds."""
-    symbol: ClassVar[str]
-    """What a threshold is called."""
-    event: ClassVar[str]
-    """What `p` is the probability of."""
-
-    @property
-    def _over(self) -> FloatArray:
-        """The thresholds, shape (k,)."""
-        return np.asarray(getattr(self, self.axis))  # a field by its name
-
-    def __len__(self) -> int:
-        """Return the number of thresholds."""
-        return len(self.p)
-
-    def __str__(self) -> str:
-        """Return a table for people."""
-        head = f"{self.symbol:>12} {f'P[{self.event}]':>10}   {100 * self.confidence:g} % band"
-        rows = zip(self._over, self.p, self.low, self.high, strict=True)
-        return "\n".join([head, *(f"{g:12.5g} {p:10.3e}   [{low:.3e}, {high:.3e}]" for g, p, low, high in rows)])
-
-    def _columns(self) -> dict[str, FloatArray]:
-        """Return the arrays by name, shape (k,) each."""
-        return {name: getattr(self, name) for name in (self.axis, "p", "low", "high", "cov", "ess")}  # fields by name
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and numbers for JSON; infinities become None."""
-        data = {name: to_json_value(values.tolist()) for name, values in self._columns().items()}
-        return {**data, "confidence": self.confidence}
-
-    def to_arrow(self) -> "pyarrow.Table":
-        """Return the curve as an Arrow table, a row for each threshold."""
-        with needs_library("pyarrow", "A table"):
-            import pyarrow as pa
-
-        return pa.table(self._columns())
-
-    def __repr__(self) -> str:
-        """Return one line; `str` has the table."""
-        over, n = self._over, len(self.p)
-        return (
-            f"<{type(self).__name__} P[{self.event}] at {n} threshold{'s' * (n != 1)}, {over.min():g} to "
-            f"{over.max():g}: {self.p.min():.3e} to {self.p.max():.3e}, {100 * self.confidence:g} % band>"
-        )
-
-    def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
-        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib."""
-        with drawing_axes(ax) as axes:
-            order = np.argsort(self._over)
-            t, p, low, high = (each[order] for each in (self._over, self.p, self.low, self.high))
-            floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
-            axes.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
-            axes.plot(t, np.where(p > 0, p, np.nan))
-            axes.set_yscale("log")
-            axes.set_xlabel(f"threshold {self.symbol}")
-            axes.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
-        return axes
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Curve(ProbabilityCurve):
+class Curve(Kept):
     """P[f(X) <= g] at several thresholds, with a band that should hold all of them at once.
 
     Example:
@@ -128,10 +48,73 @@ class Curve(ProbabilityCurve):
 
     gammas: FloatArray
     """Thresholds g, shape (k,), in the order asked for."""
+    p: FloatArray
+    """Estimated probabilities, shape (k,)."""
+    low: FloatArray
+    """Lower end of the band, shape (k,)."""
+    high: FloatArray
+    """Upper end of the band, shape (k,)."""
+    cov: FloatArray
+    """Coefficient of variation of each `p`, shape (k,)."""
+    ess: FloatArray
+    """Effective number of independent units (draws, paths) behind each `p`, shape (k,)."""
+    confidence: float
+    """Nominal probability that the band holds the truth at all k thresholds together."""
 
-    axis = "gammas"
-    symbol = "g"
-    event = "f <= g"
+    axis: ClassVar[str] = "gammas"
+    """Name of the thresholds in tables."""
+    symbol: ClassVar[str] = "g"
+    """What a threshold is called."""
+    event: ClassVar[str] = "f <= g"
+    """What `p` is the probability of."""
+
+    def __len__(self) -> int:
+        """Return the number of thresholds."""
+        return len(self.p)
+
+    def __str__(self) -> str:
+        """Return a table for people."""
+        head = f"{self.symbol:>12} {f'P[{self.event}]':>10}   {100 * self.confidence:g} % band"
+        rows = zip(self.gammas, self.p, self.low, self.high, strict=True)
+        return "\n".join([head, *(f"{g:12.5g} {p:10.3e}   [{low:.3e}, {high:.3e}]" for g, p, low, high in rows)])
+
+    def _columns(self) -> dict[str, FloatArray]:
+        """Return the arrays by name, shape (k,) each."""
+        columns = {"p": self.p, "low": self.low, "high": self.high, "cov": self.cov, "ess": self.ess}
+        return {self.axis: self.gammas, **columns}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON; infinities become None."""
+        data = {name: to_json_value(values.tolist()) for name, values in self._columns().items()}
+        return {**data, "confidence": self.confidence}
+
+    def to_arrow(self) -> "pyarrow.Table":
+        """Return the curve as an Arrow table, a row for each threshold."""
+        with needs_library("pyarrow", "A table"):
+            import pyarrow as pa
+
+        return pa.table(self._columns())
+
+    def __repr__(self) -> str:
+        """Return one line; `str` has the table."""
+        over, n = self.gammas, len(self.p)
+        return (
+            f"<{type(self).__name__} P[{self.event}] at {n} threshold{'s' * (n != 1)}, {over.min():g} to "
+            f"{over.max():g}: {self.p.min():.3e} to {self.p.max():.3e}, {100 * self.confidence:g} % band>"
+        )
+
+    def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
+        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib."""
+        with drawing_axes(ax) as axes:
+            order = np.argsort(self.gammas)
+            t, p, low, high = (each[order] for each in (self.gammas, self.p, self.low, self.high))
+            floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
+            axes.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
+            axes.plot(t, np.where(p > 0, p, np.nan))
+            axes.set_yscale("log")
+            axes.set_xlabel(f"threshold {self.symbol}")
+            axes.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
+        return axes
 
 
 register_stored(Curve)

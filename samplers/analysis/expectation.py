@@ -18,7 +18,7 @@ from samplers.analysis.base_error import (
     read_lineages,
     summarise_refits,
 )
-from samplers.analysis.curve import ProbabilityCurve, as_thresholds
+from samplers.analysis.curve import Curve, as_thresholds
 from samplers.analysis.reweight import FittedBase, RefitSums, choose_better_run, find_fitted_base, reweight_to_refits
 from samplers.analysis.weighted import (
     MIN_UNITS,
@@ -185,8 +185,8 @@ def _sum_parts_under_refits(
     return choose_better_run(found)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Exceedance(ProbabilityCurve):
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Exceedance(Curve):
     """P[failure and v(X) > t] at several thresholds t, with a band that should hold all of them at once.
 
     `low` is 0 where fewer than 5 effective independent units exceed the threshold, and `high` there that of the next
@@ -205,8 +205,6 @@ class Exceedance(ProbabilityCurve):
                  3.5  2.700e-04   [1.686e-04, 4.090e-04]
     """
 
-    thresholds: FloatArray
-    """Thresholds t, shape (k,), in the order asked for."""
     base: RefitBand | None = None
     """Band that the events behind the base distribution allow; None where it has no refits, or these tell
     nothing of any threshold."""
@@ -214,6 +212,11 @@ class Exceedance(ProbabilityCurve):
     axis = "thresholds"
     symbol = "t"
     event = "failure, v > t"
+
+    @property
+    def thresholds(self) -> FloatArray:
+        """Thresholds t, shape (k,), in the order asked for."""
+        return self.gammas
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
@@ -287,7 +290,7 @@ def compute_exceedance(
     enough = np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)
     sampling = enough[here], cov[here], sums.correlation[np.ix_(here, here)]
     return Exceedance(
-        thresholds=asked,
+        gammas=asked,
         p=sums.p[here],
         low=low[here],
         high=high[here],

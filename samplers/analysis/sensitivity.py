@@ -19,7 +19,10 @@ For parameters theta of the base, p = E[1{f(X) <= gamma}] and X ~ p0(x; theta),
     d log p / d theta = E[d log p0(X; theta) / d theta | f(X) <= gamma],
 
 the score function averaged over the failures. The simulations do not depend on theta, so none is made. The score is
-the central difference of log_prob at the failing points.
+the central difference of log_prob at the failing points. A base offers its parameters by two methods: `parameters`,
+given names of the columns of x and a base of the same family to be like, lists them, each with a `name` in words, its
+`value`, a `change` > 0 for which the sensitivity is stated, a `change_name` and the `columns` of x that it is about;
+`with_parameters` returns the same distribution with other values of them.
 
 To first order log p under refit b is log p + L_b, L_b = sum_i g_i delta_bi, with g_i = d log p / d theta_i and delta_bi
 the displacement of parameter i. Parameter i has the share cov(g_i delta_i, L) / var(L) of the spread of log p over the
@@ -40,7 +43,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -68,25 +71,6 @@ ENOUGH_POINTS = 30.0
 """Effective failing points below which importance and derivatives are called not determined."""
 SHOWN_PARAMETERS = 12
 """Rows of the table for people, and bars of the picture."""
-
-
-@runtime_checkable
-class ParametricBase(Protocol):
-    """A base distribution whose parameters can be moved one by one."""
-
-    def log_prob(self, x: FloatArray) -> FloatArray:
-        """Log density at x (n, d), shape (n,)."""
-
-    def parameters(self, names: Sequence[str] = (), like: object = None) -> Sequence[Any]:
-        """Return the parameters, given names of the columns of x and a base of the same family to be like.
-
-        Each has a `name` in words, such as "mean of log gap", its `value`, a `change` > 0 for which the sensitivity is
-        stated, such as a standard deviation for a mean, a `change_name`, such as "1 sd", and the `columns` of x that it
-        is about; none if it is about all.
-        """
-
-    def with_parameters(self, values: FloatArray) -> Any:
-        """Return the same distribution with other values of the parameters, in the order of `parameters()`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,11 +237,12 @@ def compute_sensitivity(
     labels = [
         name if size == 1 else f"{name}[{k}]" for name, size in zip(names, sizes, strict=True) for k in range(size)
     ]
-    parameters = base.parameters(labels) if isinstance(base, ParametricBase) else ()
-    if not isinstance(base, ParametricBase) or not parameters:
+    movable: Any = base if hasattr(base, "parameters") and hasattr(base, "with_parameters") else None
+    parameters = () if movable is None else movable.parameters(labels)
+    if not parameters:
         return replace(found, reason=f"the base distribution ({type(base).__name__}) offers no parameters")
-    derivatives, errors = failures.mean_of(_parameter_scores(base, failures.x))
-    shares, about = _share_spread(estimate, base, derivatives, labels)
+    derivatives, errors = failures.mean_of(_parameter_scores(movable, failures.x))
+    shares, about = _share_spread(estimate, movable, derivatives, labels)
     rows = [
         ParameterSensitivity(
             name=each.name,
@@ -305,7 +290,7 @@ def _rank_columns(
     return tuple(sorted(found, key=lambda each: -each.importance))
 
 
-def _parameter_scores(base: ParametricBase, x: FloatArray) -> FloatArray:
+def _parameter_scores(base: Any, x: FloatArray) -> FloatArray:
     """Return d log p0(x; theta) / d theta times the change of each of m parameters at x (k, d), shape (k, m)."""
     parameters = base.parameters()
     values = np.array([each.value for each in parameters])
@@ -326,7 +311,7 @@ def _parameter_scores(base: ParametricBase, x: FloatArray) -> FloatArray:
 
 
 def _share_spread(
-    estimate: EstimateData, base: ParametricBase, derivatives: FloatArray, labels: Sequence[str]
+    estimate: EstimateData, base: Any, derivatives: FloatArray, labels: Sequence[str]
 ) -> tuple[FloatArray | None, dict[str, Any]]:
     """Return the shares (m,) of parameters in the spread of log p over the refits, and the fields about the spread.
 
@@ -355,9 +340,7 @@ def _share_spread(
     return np.asarray(linear @ parts / variance), about
 
 
-def _refit_displacements(
-    base: ParametricBase, refits: Sequence[object], columns: Sequence[str]
-) -> tuple[FloatArray, list[int]]:
+def _refit_displacements(base: Any, refits: Sequence[Any], columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
     """Return by how many changes the parameters of refits differ from those of their base (R, m), and which refits.
 
     Refits that have other parameters (another number of components) are left out.
@@ -367,7 +350,7 @@ def _refit_displacements(
     values, changes = np.array([each.value for each in own]), np.array([each.change for each in own])
     rows, used = [], []
     for number, refit in enumerate(refits):
-        if not isinstance(refit, ParametricBase):
+        if not hasattr(refit, "parameters"):
             continue
         theirs = refit.parameters(columns, base)
         if [each.name for each in theirs] == names:
