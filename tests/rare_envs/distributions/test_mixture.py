@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtri_exp
 
-from rare_envs.distributions.coordinates import LEAST_DISTANCE, ClosingSpeed, Coordinates, as_finite, move_inside
+from rare_envs.distributions.coordinates import Coordinates
 from rare_envs.distributions.mixture import CHUNK, TruncatedGaussianMixture
 
 
@@ -333,12 +333,6 @@ DRIVERS: dict[str, Any] = {
 BEHIND = Coordinates.from_dict(DRIVERS)
 
 
-def test_dictionary_round_trip() -> None:
-    assert BEHIND.to_dict() == DRIVERS
-    assert Coordinates.from_dict({"low": [0.0], "high": [1.0]}).kinds == ("plain",)
-    assert BEHIND.kinds[1] == ClosingSpeed("v", "gap")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -357,18 +351,3 @@ def test_wrong_coordinates_are_refused_in_one_line(change: dict[str, Any], messa
     with pytest.raises(ValueError, match=message) as caught:
         Coordinates.from_dict({**DRIVERS, **change})
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_end_of_the_box_is_named() -> None:
-    with pytest.raises(ValueError, match="Missing high; needed are low, high"):
-        Coordinates.from_dict({key: value for key, value in DRIVERS.items() if key != "high"})
-
-
-def test_values_move_off_the_ends_by_one_float() -> None:
-    ends = move_inside(np.array([1.0, 1.5, 2.0]), 1.0, 2.0)
-    assert ends.tolist() == [np.nextafter(1.0, 2.0), 1.5, np.nextafter(2.0, 1.0)]
-    at_zero = move_inside(np.array([0.0, -0.5]), np.array([0.0, -1.0]), np.array([1.0, 0.0]))
-    assert at_zero.tolist() == [LEAST_DISTANCE, -0.5]
-    assert move_inside(np.array([0.0]), -1.0, 0.0).tolist() == [-LEAST_DISTANCE]
-    with pytest.raises(ValueError, match="gaps must be finite"):
-        as_finite("gaps", [1.0, np.inf])

@@ -1,7 +1,6 @@
 """Curves over thresholds: bands, layers, what is known."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,11 +76,6 @@ def test_where_nothing_failed_the_thresholds_passed_are_known():
 def test_thresholds_are_finite_numbers(gammas):
     with pytest.raises(ValueError, match="finite thresholds"):
         run(max_sim=100).curve(gammas)
-
-
-def test_a_method_without_weighted_points_has_no_curve():
-    with pytest.raises(ValueError, match="'mc' gave no weighted points"):
-        replace(run(max_sim=100), sample=None).curve([0.0])
 
 
 def test_points_without_an_outcome_are_not_in_the_lower_end_where_they_only_bound():

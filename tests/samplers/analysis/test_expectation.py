@@ -97,18 +97,6 @@ def test_points_of_the_further_run_count_where_the_first_has_few():
     assert both.value_refits == pytest.approx([refit.p for refit in base.refits], rel=0.3)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_weights_add_up_to_p(method):
-    result = estimate_half_space(method, max_sim=8_000)
-    failures = weigh_failures(result)
-    assert failures.weights.sum() == pytest.approx(result.p, rel=1e-12)
-    assert failures.total == len(failures.x) == np.count_nonzero(result.sample.f <= 0.0)
-    some = weigh_failures(result, most=5)
-    assert len(some.x) == 5
-    assert some.weights.sum() == pytest.approx(result.p, rel=1e-12)
-    assert np.array_equal(some.x, failures.x[some.rows])
-
-
 def test_the_mean_over_failures_is_that_of_the_truncated_normal():
     """E[X | X > 3] = phi(3) / Phi(-3) and E[X_2 | failure] = 0; errors are those of 30 seeds."""
     means, errors = [], []
@@ -264,14 +252,6 @@ def test_the_band_holds_all_thresholds_together_where_intervals_of_each_do_not(m
             held.append(one.low[0] <= truth[i] <= one.high[0])
         each += all(held)
     assert together >= 273 > each
-
-
-def test_one_threshold_has_the_interval_of_its_own():
-    """30 refits -1, 0, 1 of log p: t = 2.045, variance 20 / 29."""
-    band = band_of(np.array([-7.0]), [[-8.0, -7.0, -6.0] * 10], np.array([2.0]), cov=0.1, lineages=5.0)
-    half = 2.045230 * np.sqrt(20 / 29 + 0.01 + 0.04)
-    assert np.log([band.low[0], band.high[0]]) == pytest.approx([-7.0 - half, -7.0 + raise_log_end(half, 5.0, 0.95)])
-    assert band.spread[0] == pytest.approx(np.sqrt(20 / 29))
 
 
 def test_both_ends_fall_and_a_threshold_without_a_spread_takes_those_beside_it():
