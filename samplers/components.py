@@ -296,11 +296,12 @@ class VonMisesFisherNakagami:
         radius = np.sqrt(rng.gamma(self.m, self.omega / self.m, n))
         if len(self.mu) == 1:  # two directions
             with_mu = rng.random(n) < 1 / (1 + math.exp(-2 * self.kappa))
-            return radius[:, None] * np.where(with_mu, self.mu[0], -self.mu[0])[:, None]
+            return np.asarray((radius * np.where(with_mu, self.mu[0], -self.mu[0]))[:, None])
         from scipy import stats  # takes a second to import
 
         law = stats.vonmises_fisher(self.mu, self.kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
-        return radius[:, None] * np.asarray(law.rvs(n, random_state=rng)).reshape(n, len(self.mu))
+        directions = np.asarray(law.rvs(n, random_state=rng)).reshape(n, len(self.mu))
+        return np.asarray(radius[:, None] * directions)
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
         """Return the log density at u (n, d), shape (n,)."""

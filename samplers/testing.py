@@ -8,6 +8,7 @@ functions.
 import math
 import random
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,8 +82,12 @@ def check_seed(method: Stepping) -> None:
 
 def check_no_failure(method: Stepping) -> None:
     """Check that p = 0 with a one-sided interval and a warning where nothing fails, also where f goes downhill."""
+
+    def falling(slope: float, x: FloatArray) -> FloatArray:
+        return 30.0 - slope * x[:, 0]
+
     for dim, max_sim, slope in ((1, 5000, 0.0), (2, 5000, 0.0), (6, 5000, 0.0), (3, 3000, 1.0)):
-        result = _estimate(method, lambda x, slope=slope: 30.0 - slope * x[:, 0], dim, seed=1, max_sim=max_sim)
+        result = _estimate(method, partial(falling, slope), dim, seed=1, max_sim=max_sim)
         low, high = result.interval
         wanted = f"nothing failed: expected p = 0, interval (0, more), got\n{result}"
         _expect(result.p == low == 0 < high, method, wanted)
