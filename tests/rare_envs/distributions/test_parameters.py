@@ -103,6 +103,7 @@ def test_components_are_numbered_like_those_of_another_mixture() -> None:
     aligned = [each.value for each in swapped.parameters(like=PLAIN)]
     assert aligned[:2] == [0.3, 0.7]
     assert np.abs(np.array(aligned) - values_of(PLAIN)).max() == pytest.approx(0.1)
+    assert [each.value for each in swapped.parameters(like=FITTED)] == aligned  # as refits are to their base
     refit = replace(FITTED, distribution=swapped)
     assert [each.value for each in refit.parameters(like=FITTED)] == aligned
     single = TruncatedGaussianMixture([1.0], PLAIN.means[:1], COVARIANCES[:1], PLAIN.low, PLAIN.high)
