@@ -87,33 +87,29 @@ def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable
     may raise.
     """
     n_retried, lost, found = 0, dict[int, str](), list[tuple[NDArray[np.int64], Result]]()
-
-    def settle(rows: NDArray[np.int64], again: bool) -> None:
-        nonlocal n_retried
+    unsure: dict[int, str] | None = None
+    todo = [(np.arange(len(chunk)), False)]
+    while todo:
+        rows, again = todo.pop()
         n_retried += len(rows) if again else 0
         try:
             found.append((rows, attempt(chunk if len(rows) == len(chunk) else chunk.take(rows))))
-            return
         except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
-            met: BaseException = error
-        if getattr(met, "final", False):  # calling f again cannot help
-            raise met
-        if again and len(rows) == 1:
-            lost[int(rows[0])] = reason_of(met)
-            fail(int(rows[0]), lost[int(rows[0])], met)
-            found.append((rows, Result(np.full((1, 1), np.nan), {})))
-        else:
-            for part in split_rows(rows, met, len(chunk)):
-                settle(part, True)
-
-    settle(np.arange(len(chunk)), False)
-    unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
-    if unsure:
-        settle(np.array(sorted(unsure)), True)
+            if getattr(error, "final", False):  # calling f again cannot help
+                raise
+            if again and len(rows) == 1:
+                lost[int(rows[0])] = reason_of(error)
+                fail(int(rows[0]), lost[int(rows[0])], error)
+                found.append((rows, Result(np.full((1, 1), np.nan), {})))
+            else:
+                todo += [(part, True) for part in reversed(split_rows(rows, error, len(chunk)))]
+        if not todo and unsure is None:
+            unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
+            todo = [(np.array(sorted(unsure)), True)] if unsure else []
     whole = join_results([each for _, each in found])
     table = np.empty((len(chunk), whole.table.shape[1]))
     table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands
-    again_failed = {row: why for row, why in unsure.items() if np.isnan(table[row, 0])}
+    again_failed = {row: why for row, why in (unsure or {}).items() if np.isnan(table[row, 0])}
     for row in sorted(set(again_failed) - set(lost)):
         fail(row, again_failed[row])
     return Result(table, {**whole.notes, "reasons": {**again_failed, **lost}, "n_retried": n_retried})
@@ -161,20 +157,13 @@ class Work:
 
     def __call__(self, chunk: Request, index: Index = ()) -> Result:
         """Compute a chunk; raise an EvaluationError for a row that fails ("raise") and for results of a wrong form."""
-        if self.seed is None:
-            return self._compute(chunk)
-        torch_is_new = "torch" not in sys.modules
+        start, torch_was_known = time.perf_counter(), "torch" in sys.modules
+        compute = partial(isolate, partial(_attempt, self.problem, self.gamma), chunk, partial(self._refuse, chunk))
         with seed_generators(self.seed, index):
-            result = self._compute(chunk)
-        if torch_is_new and "torch" in sys.modules:  # its generator was not seeded
+            found = compute()
+        if not torch_was_known and "torch" in sys.modules and self.seed is not None:  # its generator was not seeded
             with seed_generators(self.seed, index):
-                return self._compute(chunk)
-        return result
-
-    def _compute(self, chunk: Request) -> Result:
-        start = time.perf_counter()
-        with np.errstate():  # a problem that sets NumPy's errors sets them for itself
-            found = isolate(partial(_attempt, self.problem, self.gamma), chunk, partial(self._refuse, chunk))
+                found = compute()
         notes = dict(found.notes)
         reasons = notes.pop("reasons")
         if chunk.kind == "gradient":
@@ -241,13 +230,19 @@ def _have_same_owner(problem: Any, whole: str, by_row: str) -> bool:
 
 
 @contextmanager
-def seed_generators(seed: int, index: Index) -> Iterator[None]:
-    """Let the global generators begin anew for the length of a block, by the seed of the run and a chunk's index.
+def seed_generators(seed: int | None, index: Index) -> Iterator[None]:
+    """Let the global generators begin anew for a block, by the seed of the run, if any, and a chunk's index.
+
+    NumPy's handling of errors is that of before at its end: a problem that sets it sets it for itself.
 
     A simulation is to draw nothing itself. One that does (a policy that samples its actions) draws the same again when
     its chunk is computed again, on whichever worker, as long as it uses the generators of `random`, `numpy.random` or,
     on the CPU, torch.
     """
+    if seed is None:
+        with np.errstate():
+            yield
+        return
     state = int(np.random.SeedSequence(seed, spawn_key=index).generate_state(1)[0])
     torch: Any = sys.modules.get("torch")  # not imported for this
     before = random.getstate(), np.random.get_state(), None if torch is None else torch.random.get_rng_state()  # noqa: NPY002
@@ -256,7 +251,8 @@ def seed_generators(seed: int, index: Index) -> Iterator[None]:
     if torch is not None:
         torch.random.default_generator.manual_seed(state)
     try:
-        yield
+        with np.errstate():
+            yield
     finally:
         random.setstate(before[0])
         np.random.set_state(before[1])  # noqa: NPY002
