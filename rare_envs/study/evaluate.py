@@ -12,7 +12,7 @@ import math
 import reprlib
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -242,7 +242,8 @@ def run_into(
     study = settle_chunk(study, executor)
     with output_folder(folder), contextlib.closing(writing.begin_journal(folder, study.question, force)) as journal:
         writing.begin_study_file(folder, study)
-        return _run(folder, study, journal, progress, executor)
+        with _keeping(folder, study, journal) as target:
+            return _finish(target, run(study, progress, journal, executor, target), journal)
 
 
 def resume(
@@ -271,12 +272,24 @@ def resume(
         if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun
             study = replace(study, question=replace(question, chunk=study.problem.tile))
         writing.note_resumption(folder, journal.earlier_seconds)
-        return _run(folder, study, journal, progress, executor)
+        with _keeping(folder, study, journal) as target:
+            return _finish(target, run(study, progress, journal, executor, target), journal)
 
 
-def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor: Executor | None = None) -> Report:
-    """Run a study into its folder; whatever stops it says what is kept."""
-    target, earlier = folder.absolute(), journal.earlier_seconds  # an ego may change the working directory
+def _finish(target: Path, report: Report, journal: Journal) -> Report:
+    """Write a report, with the time of a run that it continues; nothing is kept of what it rests on."""
+    earlier = journal.earlier_seconds
+    report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
+    with arguments.keep_answer(report):
+        writing.finish_run(target, report)
+    journal.remove()
+    return report
+
+
+@contextlib.contextmanager
+def _keeping(folder: Path, study: Study, journal: Journal) -> Iterator[Path]:
+    """Yield a folder's absolute path, as an ego may change the working one; whatever stops a run says what is kept."""
+    target = folder.absolute()
 
     def kept(report: Report | None = None) -> str:
         if not journal.has_simulations or not journal.flush():
@@ -291,10 +304,7 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
         return f" {count} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{trust}"
 
     try:
-        report = run(study, progress, journal, executor, target)
-        report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
-        with arguments.keep_answer(report):
-            writing.finish_run(target, report)
+        yield target
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{kept(error.report)}", error.report) from error
     except BadInput as error:
@@ -306,8 +316,6 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool, executor:
     except KeyboardInterrupt as error:
         known = error if isinstance(error, RunInterrupted) else RunInterrupted("Stopped.")
         raise RunInterrupted(f"{known}{kept(known.report)}", known.report) from None
-    journal.remove()
-    return report
 
 
 def compare_egos(
