@@ -75,16 +75,19 @@ class InProcess:
         yield Pool(work, workers=1)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Processes:
-    """Settings of workers that are processes."""
+    """Settings of workers that are processes, in the same order for all of them.
 
-    workers: int | None = None
-    """Number of workers; None for as many as there are cores, or as a pool says that it has."""
-    time_limit: float | None = None
-    """Longest time for a chunk [s], after which its process ends; None waits for ever. Threads cannot be ended."""
-    memory_limit: float | None = None
-    """Bytes that the simulations may take in each process, where the system can limit that (Linux)."""
+    Attributes:
+        workers: Number of workers; None for as many as there are cores, or as a pool says that it has.
+        time_limit: Longest time for a chunk [s], after which its process ends; None waits for ever. Threads cannot be
+            ended.
+        memory_limit: Bytes that the simulations may take in each process, where the system can limit that (Linux).
+    """
+
+    workers: int | None
+    time_limit: float | None
+    memory_limit: float | None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -116,6 +119,8 @@ class LocalProcesses(_Processes):
     """
 
     workers: int | None = None
+    time_limit: float | None = None
+    memory_limit: float | None = None
 
     @contextmanager
     def open(self, work: Work) -> Iterator[WorkerPool]:
@@ -148,6 +153,9 @@ class FuturesPool(_Processes):
 
     executor: Any
     """The pool, or a function without arguments that makes one, which is then shut down at the end."""
+    workers: int | None = None
+    time_limit: float | None = None
+    memory_limit: float | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -185,7 +193,10 @@ class RayCluster(_Processes):
 
     address: str | None = None
     """Of a running cluster, or "auto"; None to start one on this machine, unless `ray.init` has been called."""
-    options: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    workers: int | None = None
+    time_limit: float | None = None
+    memory_limit: float | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
     """What a task needs, as for `ray.remote`: num_cpus, num_gpus, memory, runtime_env."""
 
     @contextmanager
