@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
-from rare_envs.study.export import check_export, export_drive, export_scenario, find_trajectories
+from rare_envs.study.export import export_drive, export_scenario, find_trajectories
 from rare_envs.study.replay import Drive, drive_again
 
 SAMPLE = 0.05
@@ -223,15 +223,6 @@ X = [20.0, 5.0, 10.0]
 @pytest.fixture(scope="module")
 def problem() -> DrivingProblem:
     return DrivingProblem("rare_envs/CarFollowing-v0")
-
-
-def test_what_cannot_be_is_refused() -> None:
-    for name, form, ego, message in (
-        ("a.xosc", "opensenario", None, "did you mean 'openscenario'"),
-        ("a.xml", "openscenario", None, r"ends in \.xosc for openscenario, got .*; --format commonroad writes"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            check_export(name, form, ego)
 
 
 def test_a_missing_library_is_named(problem: DrivingProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
