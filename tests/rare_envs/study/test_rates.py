@@ -87,15 +87,6 @@ def test_measures_that_are_positive_until_contact_have_the_rate_of_collisions(
     np.testing.assert_array_equal(other.problem.evaluate(x) <= 0, collided)
 
 
-class Coasting:
-    """An ego of the user's own, which does nothing."""
-
-    observation_space = action_space = None
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        return np.zeros((len(observation), 2), np.float32), state
-
-
 def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> None:
     found = rare_envs.risk("idm", bases=bases, **FEW)
     p = [each.report.estimate.p for each in found.scenarios]
@@ -105,36 +96,25 @@ def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> Non
     assert 0 < low < expected < high
     assert sum(found.kinds.values()) == pytest.approx(expected)
     assert found.recorded_events == {"cut_in": 38, "hard_brake": 42} and found.notes == ()
-    text = str(found)
-    assert text.startswith("collisions per million km  ") and "people: 21 contacts of all kinds" in text
-    assert "38 + 15 events of 17 scenes" in text and "the uncertainty is" in text
+    assert "38 + 15 events of 17 scenes" in str(found)
 
 
-def test_an_ego_that_is_an_object(bases: dict[str, str]) -> None:
-    found = rare_envs.risk(Coasting(), scenarios=("hard_brake",), bases={"hard_brake": bases["hard_brake"]}, **FEW)
-    assert found.ego == "Coasting" and found.scenarios[0].report.estimate.p > 0.2
-
-
-REFUSED = {
-    "counted twice": ({"scenarios": ("cut_in", "car_following")}, "count twice"),
-    "site of one scenario alone": ({"sites": ("i80",), "bases": {}}, "hard_brake has no base of the site 'i80'"),
-    "base of another scenario": ({"bases": {"highway": "x.json"}}, "highway"),
-    "no frequency": ({"bases": {"cut_in": "highway"}}, "nobody counted"),
-    "unknown option": ({"speed": 3}, "speed"),
-}
-
-
-@pytest.mark.parametrize(("changes", "said"), REFUSED.values(), ids=REFUSED.keys())
-def test_bad_input_is_one_line_before_any_simulation(
-    bases: dict[str, str], monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], said: str
-) -> None:
+def test_bad_input_is_one_line_before_any_simulation(bases: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     def simulated(*_: object) -> None:
         raise AssertionError("a simulation was started")
 
     monkeypatch.setattr(rare_envs.DrivingProblem, "evaluate", simulated)
-    with pytest.raises(BadInput, match=said) as refused:
-        rare_envs.risk("idm", **{"bases": bases, **FEW, **changes})
-    assert "\n" not in str(refused.value)
+    for changes, said in (
+        (
+            {"sites": ("i80",), "bases": {}},
+            r"hard_brake has no base of the site 'i80' \(it has us101\): --base hard_br",
+        ),
+        ({"bases": {"highway": "x.json"}}, "highway"),
+        ({"speed": 3}, "speed"),
+    ):
+        with pytest.raises(BadInput, match=said) as refused:
+            rare_envs.risk("idm", **{"bases": bases, **FEW, **changes})
+        assert "\n" not in str(refused.value)
 
 
 def set_bases(monkeypatch: pytest.MonkeyPatch, **bases: object) -> None:
@@ -179,8 +159,6 @@ def test_the_base_of_a_scenario_at_a_site() -> None:
     """Pairs of US 101 were under way, and cannot be counted; the new leaders of I-80 were."""
     assert choose_base(HARD_BRAKE, None, "us101") == ("us101", ())
     assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
-    with pytest.raises(ValueError, match=r"hard_brake has no base of the site 'i80' \(it has us101\): --base hard_br"):
-        choose_base(HARD_BRAKE, None, "i80")
     car_following = scenario_named("car_following")
     note = "it has no event frequency at 'us101': 'i80' is used"
     assert choose_base(car_following, None, "us101") == ("i80", (note,))
