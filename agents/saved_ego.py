@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from gymnasium import spaces
@@ -265,6 +265,10 @@ def _open_observation(header: Mapping[str, Any], name: str) -> Any:
 # --- the Hugging Face Hub -------------------------------------------------------------------------
 
 
+@overload
+def find_hub_model(text: str) -> Path: ...
+@overload
+def find_hub_model(text: str, download: bool) -> Path | None: ...
 def find_hub_model(text: str, download: bool = True) -> Path | None:
     """Return the file of a policy "hf:USER/REPOSITORY"; None if it is not in the cache and nothing is to be downloaded.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -109,7 +110,7 @@ class ServerLink:
         poller.register(self._monitor, zmq.POLLIN)
         while True:
             left = deadline - time.monotonic()
-            ready = dict(poller.poll(max(0.0, 1000 * min(left, _LOOK))))
+            ready = dict(poller.poll(math.ceil(1000 * max(0.0, min(left, _LOOK)))))
             if self._socket in ready:
                 return protocol.open_envelope(self._socket.recv_multipart())[1]
             if ready:
@@ -338,8 +339,8 @@ class RemoteEgo:
         reply = protocol.unpack(self._link.request(protocol.pack({**message, "id": number}), timeout))
         if reply.get("type") == "error":
             reason = _one_line(reply.get("reason", "no reason given"), _MAX_REASON)
-            raise RemoteError(reason, str(reply.get("code", "")))
-        demand(reply.get("id") == number, f"an answer to {reply.get('id')!r:.50}, expected one to {number}")
+            raise RemoteError(reason, _one_line(reply.get("code", ""), _MAX_NAME))
+        demand(reply.get("id") == number, f"an answer to {protocol.show(reply.get('id'))}, expected one to {number}")
         return reply
 
     def _connect(self) -> Message:
@@ -362,7 +363,7 @@ class RemoteEgo:
                 warnings.warn(f"no ego at {address} yet: {reason}; waiting for one, {most}", stacklevel=3)
             time.sleep(_RETRY_PAUSE)
         speaks = reply.get("protocol")
-        demand(speaks == protocol.PROTOCOL, f"it speaks protocol {speaks!r:.50}, expected {protocol.PROTOCOL}")
+        demand(speaks == protocol.PROTOCOL, f"it speaks protocol {protocol.show(speaks)}, expected {protocol.PROTOCOL}")
         self._epoch += 1
         self._connected, self._warm = True, False
         return reply
@@ -384,7 +385,8 @@ class RemoteEgo:
 
 def _one_line(text: Any, most: int) -> str:
     """Return what a server said, whatever it is, as one line that a terminal can show."""
-    shown = "".join(letter if letter.isprintable() else " " for letter in str(text)[: 4 * most])
+    said = text if isinstance(text, str) else protocol.show(text, most)
+    shown = "".join(letter if letter.isprintable() else " " for letter in said[: 4 * most])
     return " ".join(shown.split())[:most]
 
 

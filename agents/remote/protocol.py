@@ -17,6 +17,7 @@ import functools
 import hashlib
 import math
 import os
+import reprlib
 from typing import Any, TypeGuard
 
 import msgpack
@@ -108,10 +109,23 @@ def is_count(value: object, most: int = MAX_COUNT) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
 
 
-def _check_shape(value: Any, most: int = MAX_BYTES) -> None:
-    """Refuse what is no list of sizes with a product of at most `most`."""
+def _check_shape(value: Any, most: int = MAX_BYTES) -> int:
+    """Return the product of a list of sizes; refuse what is none, or has a product above `most`."""
     sizes = isinstance(value, list) and len(value) <= _MAX_AXES and all(is_count(size, most) for size in value)
-    demand(sizes and math.prod(value) <= most, f"shape {value!r:.50}")
+    demand(sizes and math.prod(value) <= most, f"shape {show(value)}")
+    return math.prod(value)
+
+
+class _Short(reprlib.Repr):
+    """Texts of bounded size of what a peer sent, which may be enormous."""
+
+    def repr_bytes(self, x: bytes, level: int) -> str:
+        return repr(x[: self.maxother])
+
+
+def show(value: object, most: int = 50) -> str:
+    """Return the first letters of the text of a value that a peer sent."""
+    return _Short().repr(value)[:most]
 
 
 # --- arrays --------------------------------------------------------------------------------------
@@ -133,7 +147,7 @@ def unpack_array(given: Any) -> NDArray[Any]:
         "an array is a map of dtype, shape and data",
     )
     dtype, shape, data = given["dtype"], given["shape"], given["data"]
-    demand(dtype in DTYPES, f"dtype {dtype!r:.50}, expected one of {', '.join(DTYPES)}")
+    demand(dtype in DTYPES, f"dtype {show(dtype)}, expected one of {', '.join(DTYPES)}")
     _check_shape(shape)
     filled = isinstance(data, bytes) and len(data) == math.prod(shape) * np.dtype(dtype).itemsize
     demand(filled, f"data do not fill shape {shape} of {dtype}")
@@ -187,6 +201,9 @@ def decode_space(given: Any, nested: bool = False) -> spaces.Space[Any] | None:
         return None
     try:
         if "parts" in given and not nested:
+            boxes = [part["shape"] for part in given["parts"].values() if part and "shape" in part]
+            entries = sum(_check_shape(shape, _MAX_ENTRIES) for shape in boxes)
+            demand(entries <= _MAX_ENTRIES, f"{entries} entries of all parts, more than {_MAX_ENTRIES}")
             parts = {name: decode_space(part, nested=True) for name, part in given["parts"].items()}
             return spaces.Dict(parts) if parts and None not in parts.values() else None  # type: ignore[arg-type]
         if "n" in given:
@@ -201,7 +218,7 @@ def decode_space(given: Any, nested: bool = False) -> spaces.Space[Any] | None:
         )
         return spaces.Box(low, high, dtype=dtype)
     except Exception as error:  # the server may have sent anything
-        raise MalformedMessage(f"a space {given!r:.100}: {reason_of(error)}") from error
+        raise MalformedMessage(f"a space {show(given, 100)}: {reason_of(error):.200}") from error
 
 
 def _decode_bound(given: Any, shape: list[int], limit: float) -> NDArray[np.float64]:

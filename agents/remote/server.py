@@ -95,14 +95,14 @@ class RequestHandler:
             demand(message["id"] > last, f"expected an id above {last}, got {message['id']}")
             self._last_ids[connection] = message["id"]
         known = isinstance(kind, str) and kind in self._actions
-        demand(known, f"Unknown type {kind!r:.50}; expected {', '.join(self._actions)}.", "unknown")
+        demand(known, f"Unknown type {protocol.show(kind)}; expected {', '.join(self._actions)}.", "unknown")
         return self._actions[str(kind)](connection, message)
 
     def _hello(self, connection: bytes, message: Message) -> Message:
         """Begin a connection, and describe the ego."""
         version = message.get("protocol")
         speaks = is_count(version) and version == protocol.PROTOCOL
-        demand(speaks, f"This server speaks protocol {protocol.PROTOCOL}, not {version!r:.50}.", "version")
+        demand(speaks, f"This server speaks protocol {protocol.PROTOCOL}, not {protocol.show(version)}.", "version")
         self._forget(connection)
         self._last_ids[connection] = message["id"]
         while len(self._last_ids) > MAX_CLIENTS:

@@ -61,12 +61,14 @@ def test_actions_have_the_units_of_the_environment() -> None:
 
 
 def test_observations_of_another_form_are_refused(ego: VisionEgo) -> None:
-    with pytest.raises(ValueError, match='observation="camera\\+speed"'):
-        ego.predict(np.zeros((2, 7), np.float32))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="uint8"):
-        ego.predict({**seen(2), "camera": np.zeros((2, HEIGHT, WIDTH, 3), np.float32)})
-    with pytest.raises(ValueError, match="speed"):
-        ego.predict({**seen(2), "speed": np.zeros((3, 1), np.float32)})
+    given: list[tuple[Any, str]] = [
+        (np.zeros((2, 7), np.float32), 'observation="camera\\+speed"'),
+        ({**seen(2), "camera": np.zeros((2, HEIGHT, WIDTH, 3), np.float32)}, "uint8"),
+        ({**seen(2), "speed": np.zeros((3, 1), np.float32)}, "speed"),
+    ]
+    for observation, message in given:
+        with pytest.raises(ValueError, match=message):
+            ego.predict(observation)
     with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
         rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), dt=0.05)
 

@@ -8,11 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from training.command_line import (
-    RecordingOptions,
-    report_errors,
-    spread_options,
-)
+from training.command_line import RecordingOptions, report_errors, spread_options
 
 
 def test_an_error_of_the_user_is_one_line_and_exit_code_2(capsys):

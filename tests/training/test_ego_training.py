@@ -32,12 +32,7 @@ from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.startup import use_one_thread
 from training import sb3_vec_env, train_ego
 from training.checkpoints import load_checkpoint
-from training.ego_training import (
-    Retraining,
-    check_retrainable,
-    continue_settings,
-    restore_parameters,
-)
+from training.ego_training import Retraining, check_retrainable, continue_settings, restore_parameters
 
 ENV = "rare_envs/CutIn-v0"
 STEPS, ROWS = 64, 8

@@ -141,52 +141,44 @@ def test_reset_options_reach_our_environments() -> None:
 # --- several agents ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("env_id", "kwargs"),
-    [
-        (CUT_IN, {}),
-        pytest.param("rare_envs/Highway-v0", {"observation": "kinematics", "action": "meta"}, marks=pytest.mark.slow),
-    ],
-)
-def test_rows_are_the_agents_of_the_parallel_environment(env_id, kwargs):
+def test_rows_are_the_agents_of_the_parallel_environment():
     """The same scenarios and actions give the same observations, rewards and ends, row by row, to the last bit."""
-    batch = AgentsVectorEnv(env_id, 3, horizon=2.0, drivers="idm", **kwargs)
+    batch = AgentsVectorEnv(CUT_IN, 3, horizon=2.0, drivers="idm")
     batch.action_space.seed(0)
-    observation, _ = batch.reset(seed=0)
-    several = [rare_envs.parallel_env(env_id, horizon=2.0, drivers="idm", **kwargs) for _ in range(3)]
+    batch.reset(seed=0)
+    several = [rare_envs.parallel_env(CUT_IN, horizon=2.0, drivers="idm") for _ in range(3)]
     names, n = several[0].possible_agents, len(several[0].possible_agents)
-    x = batch._x.copy()
-    for env, row in zip(several, x, strict=True):
+    for env, row in zip(several, batch._x.copy(), strict=True):
         env.reset(options={"x": row})
-    running = [True] * 3
+    running = {0, 1, 2}
     for _ in range(30):
         actions = batch.action_space.sample()
         observation, reward, terminated, truncated, infos = batch.step(actions)
-        for b in (b for b in range(3) if running[b]):
+        over = terminated | truncated
+        for b in sorted(running):
             rows = slice(b * n, b * n + n)
             seen, earned, ended, cut, info = several[b].step(dict(zip(names, actions[rows], strict=True)))
-            last = infos["final_obs"] if (terminated | truncated)[rows].any() else observation
+            last = infos["final_obs"] if over[rows].any() else observation
             for row, agent in enumerate(names, start=b * n):
                 np.testing.assert_array_equal(last[row], seen[agent])
                 assert reward[row] == pytest.approx(earned[agent], rel=1e-6)
-            running[b] = not (terminated | truncated)[rows].any()
-            if not running[b]:
-                assert (terminated | truncated)[rows].all()  # a scenario ends for all its agents
-                for row, agent in enumerate(names, start=b * n):
-                    assert terminated[row] == (ended[agent] or ended["ego"])
+                if over[rows].any():  # a scenario ends for all its agents
+                    assert over[row] and terminated[row] == (ended[agent] or ended["ego"])
                     assert infos["final_info"]["collision"][row] == ended[agent]
                     if ended[agent] or cut[agent]:
                         assert infos["final_info"]["measure"][row] == info[agent]["measure"]
-    assert not any(running)
+            running -= {b} if over[rows].any() else set()
+    assert not running
 
 
 def test_bad_arguments():
-    with pytest.raises(ValueError, match="vehicle 'leed'"):
-        training.sb3_agents_env(CUT_IN, 4, agents=["leed"])
-    with pytest.raises(ValueError, match="one or more scenarios"):
-        training.sb3_agents_env(CUT_IN, 0)
-    with pytest.raises(ValueError, match="agent of a reward 'ego'"):
-        training.sb3_agents_env(CUT_IN, 4, agents=["lead"], rewards={"ego": adversary_reward})
+    for n, settings, message in (
+        (4, {"agents": ["leed"]}, "vehicle 'leed'"),
+        (0, {}, "one or more scenarios"),
+        (4, {"agents": ["lead"], "rewards": {"ego": adversary_reward}}, "agent of a reward 'ego'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            training.sb3_agents_env(CUT_IN, n, **settings)
 
     class Recurrent:
         def predict(self, observation, state=None, episode_start=None, deterministic=True):

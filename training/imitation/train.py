@@ -229,7 +229,7 @@ def _tensorboard(folder: Path | None, update: int) -> contextlib.AbstractContext
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
-    return contextlib.closing(SummaryWriter(str(folder), purge_step=update + 1))  # type: ignore[no-untyped-call]
+    return contextlib.closing(SummaryWriter(str(folder), purge_step=update + 1))
 
 
 def train_driver(

@@ -141,8 +141,7 @@ def test_what_cannot_be_saved_is_refused(driver, tmp_path):
 
 def test_unknown_names_get_a_suggestion(file, monkeypatch):
     with pytest.raises(
-        ValueError,
-        match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'gail', 'imitation', 'idm'",
+        ValueError, match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'gail', 'imitation', 'idm'"
     ):
         load_driver("mgial")
     with pytest.raises(ValueError, match="did you mean 'idm'"):

@@ -23,11 +23,12 @@ from agents.learned.networks import (
 )
 from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.control.idm import IDM
-from rare_envs.sensors.lidar import AHEAD_BEAM, CURVATURE_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
+from rare_envs.sensors.lidar import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import bicycle
 from samplers.methods.blocks import announced_blocks
+from tests.agents.learned.test_collision_avoidance import seen
 
 
 def replace_head(policy: Policy, weights: torch.Tensor) -> Policy:
@@ -256,22 +257,16 @@ def test_the_ego_predicts_what_it_does(driver, generator):
 # --- by rule -------------------------------------------------------------------------------------
 
 
-def seen(offset=0.0, heading=0.0, speed=15.0, ahead=100.0, rate=0.0):
-    features = torch.zeros(1, 1, 51)
-    features[..., :5] = torch.tensor([offset, heading, speed, 5.0, 2.0])
-    features[..., RANGE_COLUMNS] = 100.0
-    features[..., RANGE_COLUMNS.start + AHEAD_BEAM], features[..., RATE_COLUMNS.start + AHEAD_BEAM] = ahead, rate
-    return features
-
-
 def test_it_is_idm_on_the_beam_ahead():
-    (action,), _ = RuleDriver().act(seen(ahead=22.5, rate=-3.0))
+    (action,), _ = RuleDriver().act(seen(15.0, range_0=22.5, rate_0=-3.0).float())
     expected = IDM().acceleration(torch.tensor([15.0]), Lead(torch.tensor([20.0]), torch.tensor([3.0])))
     assert action[0, 0] == pytest.approx(float(expected))
 
 
 def test_it_steers_back_to_the_middle_and_along_the_road():
-    driver = RuleDriver()
-    assert driver.act(seen(offset=0.09))[0][0, 0, 1] == pytest.approx(-5 * 0.01, rel=1e-3)
-    assert driver.act(seen(heading=0.01))[0][0, 0, 1] == pytest.approx(-0.05)
-    assert driver.act(seen(offset=3.0))[0][0, 0, 1] == pytest.approx(-0.3)
+    for place, expected in (
+        ({"lane_offset": 0.09}, pytest.approx(-5 * 0.01, rel=1e-3)),
+        ({"heading": 0.01}, pytest.approx(-0.05)),
+        ({"lane_offset": 3.0}, pytest.approx(-0.3)),
+    ):
+        assert RuleDriver().act(seen(15.0, **place).float())[0][0, 0, 1] == expected

@@ -155,14 +155,6 @@ def test_a_ripe_driver_steers_into_the_next_lane_and_keeps_off_whoever_is_ahead_
     assert float(action[..., 0]) > -1.0
 
 
-def test_a_driver_steers_back_from_the_edge_of_the_road():
-    driver, none = load_driver("mgail"), torch.zeros(1, 1, 2)
-    outside = on_lane(1.8 + 0.3, 0.0).float()  # 0.3 m over the line at 20 m/s
-    back = -(0.3 + LaneChanges.margin) / 0.6 / (0.2 * 20.0)
-    action, _ = driver.act(outside, None, none, driver.begin(torch.zeros(1, 1, 2, 2)))
-    assert float(action[..., 1]) == pytest.approx(back)
-
-
 def test_hard_braking_is_eased_but_for_the_rule():
     plain = load_driver("mgail?rules=0")
     features = on_lane(range_0=9.0, rate_0=-9.0).float()

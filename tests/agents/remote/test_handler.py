@@ -199,8 +199,10 @@ def test_spaces_survive_the_journey_and_lies_do_not() -> None:
     box: dict[str, Any] = {"shape": [2], "low": [0.0, 0.0], "high": 1.0}
     wrong: list[Any] = [7, "box", [], {}, {"n": 0}, {"n": -1}, {"n": True}, {"n": 1e9}, {"parts": []}]
     wrong += [{"parts": {"a": {"parts": {"b": {"n": 2}}}}}, {"parts": {"a": 3}}]
+    wrong += [{"parts": {name: {"shape": [2**22]} for name in "abc"}}, {**box, "low": b"\x00" * 10_000}]
     wrong += [{**box, "shape": shape} for shape in ([-2], [2**40], [2**12, 2**12], "2", [[2]], [1.5])]
     wrong += [{**box, "low": low} for low in ([0.0] * 3, "zero", float("nan"), 2.0, {}, [[0.0], [0.0, 1.0]])]
     for given in wrong:
-        with pytest.raises(protocol.MalformedMessage, match="a space"):
+        with pytest.raises(protocol.MalformedMessage, match="a space") as caught:
             protocol.decode_space(given)
+        assert len(str(caught.value)) < 400

@@ -13,24 +13,14 @@ import rare_envs
 from benchmarks.papers import renew
 from benchmarks.papers.__main__ import main
 from benchmarks.papers.okelly2018.study import HighwayStudy
-from benchmarks.papers.record import (
-    check_folder,
-    compare,
-    find,
-    format_record,
-    make_record,
-    make_table,
-    write_record,
-)
+from benchmarks.papers.record import check_folder, compare, find, format_record, make_record, make_table, write_record
 from benchmarks.papers.renew import read_records, read_replications, renew_okelly, renew_tian
-from benchmarks.papers.tian2024 import study
 from benchmarks.papers.tian2024.replications import ReplicationJob, row_of, run_replication
 from benchmarks.papers.tian2024.study import TianPlan
 from benchmarks.papers.tian2024.summary import make_method_tables
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 from samplers.output import to_json_value
-from tests.benchmarks.papers.made_runs import made_run
 
 OKELLY, TIAN = "okelly2018", "tian2024"
 TIAN_RUNS, HIGHWAY_RUNS = TianPlan(5).identity, HighwayStudy().identity
@@ -78,19 +68,6 @@ def test_nothing_run_is_said_to_be_so(tmp_path: Path, capsys) -> None:
     assert all(value["ours"] is None for table in record["tables"] for value in table["values"])
     assert "Made: 0 of" in record["notes"][1]
     assert "not run" in (tmp_path / "reproduction.md").read_text()
-
-
-def test_it_goes_on_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
-    seeds: list[int] = []
-    monkeypatch.setattr(study, "run_replication", lambda job: (seeds.append(job.seed), made_run(job))[1])
-    few = [TIAN, "--out", str(tmp_path), "--replications", "2"]
-    assert main(few) == 0
-    assert "IS is off by 2 to 17 %" in capsys.readouterr().out
-    first = len(seeds)
-    main(few)
-    assert len(seeds) == first
-    assert main([*few, "--seed", "1"]) == 2
-    assert "choose another --out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -157,14 +134,6 @@ def test_a_record_says_what_made_it_and_is_written(tmp_path: Path) -> None:
     assert "- *traffic*: Other roads, see `maps`." in lines
     assert "- Figure 9. A line. In the paper: Another line." in lines
     assert {line.count("|") for line in lines if line.startswith("|")} == {11, 6}
-
-
-def test_a_table_has_the_labels_and_reasons_that_it_names() -> None:
-    values = [compare(("x",), "p", reasons=("traffic",))]
-    with pytest.raises(ValueError, match="Expected 2 labels"):
-        make_table("t", "t", ("a", "b"), values, {})
-    with pytest.raises(ValueError, match="No explanation 'traffic'"):
-        make_table("t", "t", ("a",), values, {})
 
 
 @pytest.fixture(scope="module")

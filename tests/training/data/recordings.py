@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.io import savemat
@@ -91,37 +92,24 @@ def simulate(seed=0, lanes=3, per_lane=16, seconds=24.0, changers=0.4):
     return Traffic(**record, length=length, width=width, lanes=lanes, changed=changed)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """Rows of the vehicles within the recorded road at every so many steps, by vehicle, then by time, (n,) each."""
-
-    step: np.ndarray
-    vehicle: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
-    length: np.ndarray
-    width: np.ndarray
-    lane: np.ndarray
-    """0 the leftmost."""
-
-    def ahead(self):
-        """Vehicle ahead in the same lane, by centres; -1: none."""
-        found = np.full(len(self.x), -1)
-        for row in range(len(self.x)):
-            near = (self.step == self.step[row]) & (self.lane == self.lane[row]) & (self.x > self.x[row])
-            if near.any():
-                found[row] = self.vehicle[near][np.argmin(self.x[near])]
-        return found
-
-
 def see(traffic, every, road):
+    """Rows of the vehicles within the recorded road at every so many steps, by vehicle, then by time, (n,) each."""
     step, vehicle = np.nonzero(traffic.inside(road)[::every])
     order = np.lexsort([step, vehicle])
-    at = every * step[order], vehicle[order]
-    moving = (getattr(traffic, name)[at] for name in ("x", "y", "speed", "acceleration"))
-    return Seen(*at, *moving, traffic.length[at[1]], traffic.width[at[1]], traffic.lane[at])
+    step, vehicle = every * step[order], vehicle[order]
+    moving = {name: getattr(traffic, name)[step, vehicle] for name in ("x", "y", "speed", "acceleration", "lane")}
+    sizes = {name: getattr(traffic, name)[vehicle] for name in ("length", "width")}
+    return SimpleNamespace(step=step, vehicle=vehicle, **moving, **sizes)
+
+
+def ahead_of(seen):
+    """Vehicle ahead in the same lane, by centres; -1: none."""
+    found = np.full(len(seen.x), -1)
+    for row in range(len(seen.x)):
+        near = (seen.step == seen.step[row]) & (seen.lane == seen.lane[row]) & (seen.x > seen.x[row])
+        if near.any():
+            found[row] = seen.vehicle[near][np.argmin(seen.x[near])]
+    return found
 
 
 def as_rows(columns, digits=4):
@@ -158,7 +146,7 @@ def write_ngsim(path, traffic, road=ROAD):
         "v_Vel": seen.speed / FOOT,
         "v_Acc": seen.acceleration / FOOT,
         "Lane_ID": seen.lane + 1,
-        "Preceding": seen.ahead() + 1,
+        "Preceding": ahead_of(seen) + 1,
         "Following": 0,
         "Space_Headway": 0.0,
         "Time_Headway": 0.0,
@@ -174,7 +162,7 @@ def coifman_matrix(traffic, road=ROAD):
     matrix = np.zeros((len(seen.x), 18))
     matrix[:, [0, 1, 5]] = np.column_stack([seen.vehicle + 1, seen.step // 5 + 1, (seen.x - 0.5 * seen.length) / FOOT])
     motion = seen.speed / FOOT, seen.acceleration / FOOT
-    matrix[:, 11:15] = np.column_stack([*motion, seen.lane + 1, seen.ahead() + 1])
+    matrix[:, 11:15] = np.column_stack([*motion, seen.lane + 1, ahead_of(seen) + 1])
     return matrix
 
 
@@ -196,7 +184,7 @@ def write_highd(folder, upper, lower, recording="01", road=420.0):
         later = np.minimum(seen.step + 1, len(traffic.y) - 1)
         across = (traffic.y[later, seen.vehicle] - seen.y) / DT
         x, y = (seen.x, seen.y) if sign > 0 else (road - seen.x, LANE * traffic.lanes - seen.y)
-        ahead = seen.ahead()
+        ahead = ahead_of(seen)
         columns = {
             "frame": seen.step // 2 + 1,
             "id": first + seen.vehicle,

@@ -143,16 +143,13 @@ def test_brakings_are_found_with_their_size():
     np.testing.assert_allclose(events["deceleration"][own], DECELERATIONS, rtol=0.12)
 
 
-def test_a_braking_that_does_not_end_in_a_standstill_is_none():
-    assert len(hard_brake_events(stopping_traffic(SPEEDS, GAPS, DECELERATIONS, final=5.0))["speed"]) == 0
-
-
-def test_a_braking_under_way_where_a_track_begins_is_left_out():
+def test_a_braking_counts_from_its_onset_to_a_standstill():
     """A hole 2.5 s after the onset: the track behind it begins in the braking. A hole before it leaves the braking."""
     table = stopping_traffic((14.0,), (15.0,), (2.5,))
-    assert len(hard_brake_events(table)["frame"]) == 2
-    assert len(hard_brake_events(table.select(np.abs(table.frame - PAUSE - 25) > 2))["frame"]) == 0
-    assert len(hard_brake_events(table.select(np.abs(table.frame - PAUSE + 30) > 2))["frame"]) == 2
+    assert len(hard_brake_events(stopping_traffic((14.0,), (15.0,), (2.5,), final=5.0))["frame"]) == 0
+    for hole, found in ((None, 2), (25, 0), (-30, 2)):
+        kept = table.select(np.full(len(table), True) if hole is None else np.abs(table.frame - PAUSE - hole) > 2)
+        assert len(hard_brake_events(kept)["frame"]) == found
 
 
 def positions(table):

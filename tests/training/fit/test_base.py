@@ -11,23 +11,11 @@ from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
-from training.fit import mixture as mixture_fit
-from training.fit.base import (
-    CHECK_DRAWS,
-    check_predictions,
-    fit_base,
-    format_base,
-    mass_outside,
-)
+from training.fit.base import CHECK_DRAWS, check_predictions, fit_base, format_base, mass_outside
 from training.fit.filters import EventSet
 
 FREQUENCY = EventFrequency(count=60, hours=6.0, km=200.0, definition="a pair begins", source="made up")
 SOURCE = {"site": "nowhere", "data": "made up", "licence": "none"}
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
 
 
 def fitted(n=60, **changes):

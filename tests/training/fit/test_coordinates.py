@@ -21,19 +21,7 @@ from training.fit.coordinates import (
     refit,
 )
 from training.fit.filters import EventSet
-from training.fit.mixture import (
-    EM_ITERATIONS,
-    SMALLEST_COMPONENT,
-    TOLERANCE,
-    fit_mixture,
-    select_mixture,
-)
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """Fewer starts: enough for well separated clusters."""
-    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
+from training.fit.mixture import EM_ITERATIONS, SMALLEST_COMPONENT, TOLERANCE, fit_mixture, select_mixture
 
 
 def test_a_component_on_a_handful_of_events_is_rejected(quick):

@@ -24,14 +24,8 @@ from tests.training.data.recordings import (
 from training.command_line import EventOptions
 from training.data.events import braking_exposure, car_following_events, cut_in_events
 from training.data.table import synthetic_traffic
-from training.fit import mixture as mixture_fit
 from training.fit.filters import EVENT_RECIPES, filter_events, read_events
-from training.fit.recordings import (
-    count_events,
-    fit_bases,
-    fit_own_bases,
-    observe_traffic,
-)
+from training.fit.recordings import count_events, fit_bases, fit_own_bases, observe_traffic
 
 GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
 
@@ -39,11 +33,6 @@ GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
 @pytest.fixture(scope="module")
 def simulated():
     return simulate(0, lanes=3, per_lane=12, seconds=20.0, changers=0.8)
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
 
 
 def fit(out, between=None, scenarios=None, **source):

@@ -20,12 +20,7 @@ from training.imitation.learner import (
     run_updates,
     scaling_of,
 )
-from training.imitation.rollout import (
-    ScenePool,
-    compute_penalties,
-    normalise_action,
-    roll_out,
-)
+from training.imitation.rollout import ScenePool, compute_penalties, normalise_action, roll_out
 from training.imitation.traffic import Pairs, Recording, Traffic, collect_pairs, stack_scenes
 from training.imitation.train import make_learner, train_learner
 

@@ -7,12 +7,7 @@ import pytest
 import torch
 
 from tests.training.imitation.synthetic_scenes import at_start, generator, scene, tiny
-from training.imitation.evaluate import (
-    binned_quantities,
-    jensen_shannon,
-    measure,
-    recorded_behaviour,
-)
+from training.imitation.evaluate import binned_quantities, jensen_shannon, measure, recorded_behaviour
 from training.imitation.rollout import draw_pool
 from training.imitation.traffic import stack_scenes, start_replay, step_replay
 

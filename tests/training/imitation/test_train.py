@@ -14,10 +14,7 @@ from typer.testing import CliRunner
 from agents import load_driver, read_provenance
 from agents.learned.networks import WHITE_NOISE, head_weights
 from rare_envs.study.cli.app import app
-from tests.training.data.recordings import (
-    simulate,
-    write_highd,
-)
+from tests.training.data.recordings import simulate, write_highd
 from tests.training.imitation.synthetic_scenes import TINY, scene, scenes, tiny
 from training.imitation import __main__ as command_line
 from training.imitation.config import Config

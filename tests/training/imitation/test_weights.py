@@ -11,12 +11,7 @@ from agents.learned.networks import HEAD_SIZE, WeightDistribution, head_weights
 from tests.training.imitation.synthetic_scenes import scenes, tiny
 from training.imitation import weights as module
 from training.imitation.train import DRIVER, Source, train_driver
-from training.imitation.weights import (
-    Ensemble,
-    fit_weights,
-    make_ensemble,
-    train_members,
-)
+from training.imitation.weights import Ensemble, fit_weights, make_ensemble, train_members
 
 FEW = Ensemble(members=10, updates=2)
 D = 12

@@ -41,17 +41,14 @@ def test_command_recovers_a_road_and_names_broken_files(tmp_path: Path, capsys: 
 
 def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path):
     scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
-    for kind, metrics in (("gail", {"collision": 0.05234567}), ("mgail", {"collision": 0.004, "js": {"speed": 0.03}})):
-        provenance = Provenance(
-            kind=kind,
-            command=f"train {kind}",
-            data="US 101, 3 minutes.",
-            data_licence="CC BY-SA 3.0",
-            metrics=metrics,
-            ensemble={"penalty": 0.5, "tried": [{"penalty": 0.8}]} if kind == "mgail" else {},
-        )
+    licence = {"data": "US 101, 3 minutes.", "data_licence": "CC BY-SA 3.0"}
+    for kind, metrics, ensemble in (
+        ("gail", {"collision": 0.05234567}, {}),
+        ("mgail", {"collision": 0.004, "js": {"speed": 0.03}}, {"penalty": 0.5, "tried": [{"penalty": 0.8}]}),
+    ):
+        about = Provenance(kind=kind, command=f"train {kind}", **licence, metrics=metrics, ensemble=ensemble)
         driver = LearnedDriver(Policy(scaling), colour=AutoregressiveNoise((0.95, 0.0)), name=kind)
-        save_driver(driver, provenance, tmp_path / f"{kind}.safetensors")
+        save_driver(driver, about, tmp_path / f"{kind}.safetensors")
     main(tmp_path)
     card = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert card == format_model_card(tmp_path)
