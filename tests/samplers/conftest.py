@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import samplers
 from samplers.method import Interrupted
@@ -47,8 +48,20 @@ class Study:
         return sum(r.interval[0] <= self.p <= r.interval[1] for r in self.results)
 
     @property
+    def error(self) -> float:
+        """The standard error of the mean ratio."""
+        return float(self.ratios.std(ddof=1) / np.sqrt(len(self.results)))
+
+    @property
     def own_cov(self) -> float:
-        return float(np.mean([result.cov for result in self.results]))
+        """The median of the finite c.o.v.: a run without a failure has none, and would make a mean infinite."""
+        covs = np.array([result.cov for result in self.results])
+        return float(np.median(covs[np.isfinite(covs)]))
+
+    def check(self, bias: float = 0.0, confidence: float = 0.90) -> None:
+        """Check mean (within four standard errors and a bias) and coverage (by chance lower in 1 of 1,000 studies)."""
+        assert abs(self.ratios.mean() - 1) < 4 * self.error + bias
+        assert self.covered >= stats.binom.ppf(1e-3, len(self.results), confidence)
 
 
 class Driven(NamedTuple):

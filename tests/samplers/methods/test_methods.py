@@ -30,10 +30,6 @@ def method(request):
     return samplers.get_method(request.param)
 
 
-def test_registered_under_its_own_name(method):
-    assert samplers.METHODS[method.name] is type(method)
-
-
 @pytest.mark.parametrize("name", METHODS.own)
 def test_our_own_are_frozen_documented_dataclasses_that_can_be_asked(name):
     method = samplers.get_method(name)
@@ -146,16 +142,10 @@ BIAS = {"two-stage": 0.005, "surrogate": 0.0, "mc": 0.0, "is": 0.01, "ce": 0.01,
 cross-entropy misses a little of the tail beyond its proposal in most runs."""
 
 
-def judge(study, method):
-    """Mean within four standard errors (and the stated bias), coverage not below 90 %, own c.o.v. near the spread."""
-    runs = len(study.results)
-    error = study.ratios.std(ddof=1) / np.sqrt(runs)
-    assert abs(study.ratios.mean() - 1) < 4 * error + BIAS.get(method.name, 0.05)
-    assert study.covered >= stats.binom.ppf(1e-3, runs, 0.90)
-    assert 0.7 < study.own_cov / study.ratios.std(ddof=1) < 1.4
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("reference", REFERENCES, ids=lambda r: r.name)
 def test_right_on_average_and_covered_with_many_seeds(method, study, reference):
-    judge(study(reference, method, 200, max_sim=MAX_SIM.get(method.name)), method)
+    """The own c.o.v. is near the spread too: the median of the finite ones, as one run of 200 may find no failure."""
+    found = study(reference, method, 200, max_sim=MAX_SIM.get(method.name))
+    found.check(BIAS.get(method.name, 0.05))
+    assert 0.7 < found.own_cov / found.ratios.std(ddof=1) < 1.4
