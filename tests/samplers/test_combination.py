@@ -59,6 +59,7 @@ def test_replicates_of_monte_carlo_are_one_longer_run():
     assert result.p == hits / 100_001
     assert result.interval == clopper_pearson(hits, 100_001, 0.95)
     assert result.cov == binomial_cov(hits / 100_001, 100_001)
+    assert result.gain == pytest.approx(1.0)
 
 
 def test_pooled_counts_weigh_draws_not_runs():

@@ -22,6 +22,7 @@ class Plain:
     stops_at_target: ClassVar[bool] = False
 
     def steps(self, inputs, goal, rng):
+        assert not hasattr(inputs, "evaluate")  # nobody can simulate past the books
         if self.fault == "own seed":
             rng = np.random.default_rng(1)
         if self.fault == "numpy's generator":
@@ -29,7 +30,7 @@ class Plain:
         if self.fault == "python's generator":
             random.random()
         n = min(3000, goal.budget) + (self.fault == "overspends")
-        f, trace, status = np.empty(0), [], samplers.Status.CONVERGED
+        f, status = np.empty(0), samplers.Status.CONVERGED
         while len(f) < n:
             try:
                 f = np.append(f, (yield inputs.base.sample(min(500, n - len(f)), rng)))

@@ -3,22 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 import samplers
-from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.methods import monte_carlo as kept_draws
 from samplers.methods.monte_carlo import KeptDraws
-
-EASY = half_space(2, beta=1.5)
-
-
-def test_is_the_share_of_failures_with_the_exact_interval():
-    result = samplers.estimate(EASY.problem, "mc", seed=1, max_sim=2000)
-    assert result.p == result.failures.total / 2000
-    assert result.gain == pytest.approx(1.0)
-    assert result.interval == samplers.sample.clopper_pearson(result.failures.total, 2000, 0.95)
 
 
 def test_draws_from_the_base_itself():
@@ -62,7 +51,6 @@ def test_memory_does_not_grow_with_the_draws() -> None:
         zeros[::2] = 1.0
         draws.add(x, zeros)
     kept = sum(part.nbytes for rows in (draws._f, draws._x, draws._f_failing) for part in rows._parts)
-    limit = 8 * kept_draws.MOST_DRAWS + 2 * kept_draws.MOST_FAILING_BYTES
-    assert kept <= limit
+    assert kept <= 8 * kept_draws.MOST_DRAWS + 2 * kept_draws.MOST_FAILING_BYTES
     kept = len(draws.outcome(Goal(gamma=0.0), []).sample.f)
     assert kept < 2 * kept_draws.MOST_DRAWS + kept_draws.MOST_FAILING_BYTES // 8

@@ -43,8 +43,8 @@ def test_many_dimensions_are_left_to_two_stage():
     assert "two-stage takes over" in result.remarks[0]
 
 
-def run(f, dim, seed=0, max_sim=300, **options):
-    return samplers.estimate(FunctionProblem(f, dim), "surrogate", seed=seed, max_sim=max_sim, **options)
+def run(f, dim, seed=0):
+    return samplers.estimate(FunctionProblem(f, dim), "surrogate", seed=seed, max_sim=300)
 
 
 @pytest.mark.slow
@@ -90,19 +90,12 @@ def test_no_failure_is_left_to_plain_monte_carlo():
 @pytest.mark.parametrize(("dim", "beta"), [(2, 3.5), (8, 3.0)])
 def test_mean_and_coverage_over_many_seeds(dim, beta, study):
     found = study(half_space(dim, beta), samplers.Surrogate(n=300), 100)
-    assert abs(found.ratios.mean() - 1) < 4 * found.ratios.std(ddof=1) / 10
+    assert abs(found.ratios.mean() - 1) < 4 * found.error
     assert found.covered >= 88
 
 
 def points(n, dim, seed=0, scale=2.0):
     return scale * np.random.default_rng(seed).standard_normal((n, dim))
-
-
-def misjudged(f, dim=2, n=80):
-    """Share of fresh points whose more likely side is not theirs, after n points."""
-    u, new = points(n, dim), points(2000, dim, seed=1)
-    prediction = fit_kriging(u, f(u)).predict(new)
-    return float(((prediction.mean <= 0) != (f(new) <= 0)).mean())
 
 
 @pytest.mark.parametrize(
@@ -117,7 +110,10 @@ def misjudged(f, dim=2, n=80):
     ids=["plane", "capped", "floored", "capped and minus infinity", "two bent regions"],
 )
 def test_few_points_are_misjudged(f):
-    assert misjudged(f) < 0.02
+    """Fresh points whose more likely side is not theirs, after 80 points."""
+    u, new = points(80, 2), points(2000, 2, seed=1)
+    prediction = fit_kriging(u, f(u)).predict(new)
+    assert ((prediction.mean <= 0) != (f(new) <= 0)).mean() < 0.02
 
 
 def test_censoring_serves_where_f_has_a_cap():
@@ -138,8 +134,7 @@ def test_noise_is_taken_as_noise():
 
 @pytest.mark.parametrize("y", [[np.inf] * 4, [-np.inf, np.inf], [0.0, 0.0, 0.0], [1e300, -3e300]])
 def test_any_outcomes_are_compressed_to_finite_numbers_of_their_sign(y):
-    y = np.array(y)
-    z = compress_outcomes(y, outcome_scale(y)).z
+    z = compress_outcomes(y := np.array(y), outcome_scale(y)).z
     assert np.isfinite(z).all()
     np.testing.assert_array_equal(np.sign(z), np.sign(y))
 

@@ -1,6 +1,5 @@
-"""Two-stage: budget, target, any kind of f, runs that are stopped, coverage; what takes over where no proposal fits."""
+"""Two-stage: budget, any kind of f, runs that are stopped, coverage; what takes over where no proposal fits."""
 
-import functools
 import math
 
 import numpy as np
@@ -43,27 +42,14 @@ def noisy(dim=6, noise=0.5):
     return reference(f"noisy_d{dim}", f, dim, PHI(-3.5 / math.sqrt(1 + noise**2)))
 
 
-def linear(beta, dim=3):
-    return FunctionProblem(lambda u: beta - u[:, 0], dim)
-
-
-def near(result, p):
-    """Within four of its own standard errors."""
-    return abs(result.p / p - 1) < 4 * result.cov
-
-
-def sane(result, rows):
-    low, high = result.interval
-    assert result.n_sim == rows == sum(level.n_sim for level in result.trace)
-    assert 0 <= low <= result.p <= high <= 1
-    assert high > 0
-    assert result.cov >= 0
-
-
-def counted(recorder, problem, **options):
+def counted(recorder, problem, method="two-stage", **options):
+    """Return an estimate whose counts and interval are sane."""
     f = recorder(problem.f)
-    result = samplers.estimate(FunctionProblem(f, problem.dim), TS(), **options)
-    sane(result, f.rows)
+    result = samplers.estimate(FunctionProblem(f, problem.dim), method, **options)
+    low, high = result.interval
+    assert result.n_sim == f.rows == sum(level.n_sim for level in result.trace)
+    assert 0 <= low <= result.p <= high <= 1
+    assert high > 0 and result.cov >= 0
     return result
 
 
@@ -103,33 +89,8 @@ def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
     ids=["infinite", "an indicator", "steps"],
 )
 def test_any_kind_of_outcome(f):
-    assert near(samplers.estimate(FunctionProblem(f, 3), TS(), seed=1, max_sim=2500), PHI(-3.0))
-
-
-def test_missing_outcomes():
-    """NaN beyond u2 > 2.5: counted as failing, and left out of the lower end with "bound"."""
-
-    def f(u):
-        return np.where(u[:, 1] > 2.5, np.nan, 2.5 - u[:, 0])
-
-    problem, half = FunctionProblem(f, 3), PHI(-2.5)
-    with pytest.raises(samplers.EvaluationError):
-        samplers.estimate(problem, TS(), seed=1)
-    counts = samplers.estimate(problem, TS(), seed=1, max_sim=2500, on_error="failure")
-    bound = samplers.estimate(problem, TS(), seed=1, max_sim=2500, on_error="bound")
-    assert near(counts, 2 * half - half**2)
-    assert bound.p == counts.p
-    assert bound.interval[1] == counts.interval[1]
-    assert bound.interval[0] / counts.interval[0] == pytest.approx(0.5, abs=0.06)
-
-
-def test_sample_gives_p_and_higher_thresholds():
-    result = samplers.estimate(half_space(100, 3.5).problem, TS(), seed=1)
-    sample = result.sample
-    assert sample.weights[sample.f <= 0].sum() == pytest.approx(result.p, rel=1e-9)
-    for g in (0.5, 1.0, 2.0, 3.5):
-        weights = sample.weights[sample.f <= g]
-        assert weights.sum() == pytest.approx(PHI(g - 3.5), abs=4 * np.sqrt((weights**2).sum()))
+    result = samplers.estimate(FunctionProblem(f, 3), TS(), seed=1, max_sim=2500)
+    assert abs(result.p / PHI(-3.0) - 1) < 4 * result.cov
 
 
 def test_estimate_rests_on_the_draws_of_the_last_round_and_those_after_it_alone():
@@ -146,32 +107,12 @@ def test_estimate_rests_on_the_draws_of_the_last_round_and_those_after_it_alone(
     assert [level.n_sim for level in result.trace[-2:]] == [len(x) for x in asked[-2:]]
 
 
-STOPPED = {r.name: r for r in (half_space(100, 3.0), two_regions(5, 2.8, 3.0))}
-
-
-@functools.cache
-def batches_of(name):
-    """How many batches the whole run takes."""
-    run, n = TS(n=4000).start(STOPPED[name].problem, seed=3), 0
-    while not run.done:
-        run.tell(STOPPED[name].problem.f(run.ask()))
-        n += 1
-    return n
-
-
-@pytest.mark.parametrize("after", [2, 20, 44])
-@pytest.mark.parametrize("reference", STOPPED.values(), ids=STOPPED)
-def test_stopped_in_any_phase(reference, after):
+@pytest.mark.parametrize("after", [500, 1500, 2000])
+@pytest.mark.parametrize("reference", [half_space(100, 3.0), two_regions(5, 2.8, 3.0)], ids=lambda r: r.name)
+def test_stopped_in_any_phase(recorder, reference, after):
     """What draws from known distributions say so far: an interval that holds p, give or take."""
-    run, rows = TS(n=4000).start(reference.problem, seed=3), 0
-    for _ in range(min(after, batches_of(reference.name) - 1)):
-        u = run.ask()
-        rows += len(u)
-        run.tell(reference.problem.f(u))
-    assert not run.done
-    run.stop()
-    result = run.result()
-    sane(result, rows)
+    stop = lambda seen: seen.n_sim >= after  # noqa: E731
+    result = counted(recorder, reference.problem, TS(n=4000), seed=3, stop=stop)
     assert result.status == "stopped"
     assert result.interval[0] / 1.3 <= reference.p <= 1.3 * result.interval[1]
     if result.p > 0:
@@ -196,48 +137,33 @@ def test_subset_simulation_takes_over(recorder):
 
 @pytest.mark.parametrize("max_sim", [800, 1500])
 def test_a_small_exploration_says_so(max_sim):
-    result = samplers.estimate(linear(3.0), TS(), seed=0, max_sim=max_sim)
+    result = samplers.estimate(half_space(3, 3.0).problem, TS(), seed=0, max_sim=max_sim)
     assert any("may miss" in text for text in result.warnings) == (max_sim < 1500)
-
-
-def judge(found, bias=0.01):
-    """Mean within four standard errors and a little; intervals hold p no less often than nine in ten times."""
-    runs = len(found.results)
-    error = max(found.ratios.std(ddof=1), found.own_cov) / math.sqrt(runs)
-    assert abs(found.ratios.mean() - 1) < 4 * error + bias
-    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "reference",
     [
-        half_space(2),
-        half_space(100),
-        half_space(6, 5.0),
-        two_regions(30),
-        four_branches(),
-        plateau(),
-        shell(),
-        deceptive(),
-        noisy(),
+        *(half_space(2), half_space(100), half_space(6, 5.0), two_regions(30), four_branches()),
+        *(plateau(), shell(), deceptive(), noisy()),
     ],
     ids=lambda r: r.name,
 )
 def test_right_and_covered_with_many_seeds(study, reference):
     found = study(reference, TS(), 40)
-    judge(found, 0.005)
+    found.check(0.005)
     assert 0.6 < found.own_cov / found.ratios.std(ddof=1) < 1.6
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["slabs_d20", "squares_d50"])
 def test_subset_simulation_is_right_and_covered(study, name):
-    judge(study(case(name), TS(), 40), 0.05)
+    study(case(name), TS(), 40).check(0.05)
 
 
 @pytest.mark.slow
 def test_hardly_any_bias_where_plain_draws_take_over(study):
     """Whether a tenth of the base draws fails decides on the rest, and they count: 0.8 % too high at p = 0.1."""
     p, beta = 0.1, -stats.norm.ppf(0.1)
-    judge(study(reference("common", lambda u: beta - u[:, 0], 2, p), TS(), 100, max_sim=2000), 0.008)
+    study(reference("common", lambda u: beta - u[:, 0], 2, p), TS(), 100, max_sim=2000).check(0.008)
