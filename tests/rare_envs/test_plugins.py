@@ -5,11 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.plugins import (
-    did_you_mean,
-    import_module,
-    import_object,
-)
+from rare_envs.plugins import did_you_mean, import_module, import_object
 
 
 @pytest.fixture

@@ -26,9 +26,7 @@ class Constant:
         self.batches: list[int] = []
         self.__dict__.update(attributes)
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> Any:
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
         assert deterministic
         self.batches.append(len(observation))
         return np.repeat(self.action[None], len(observation), axis=0), state
@@ -57,9 +55,7 @@ def test_recurrent_egos_get_their_state_back() -> None:
     seen: list[tuple[Any, bool]] = []
 
     class Recurrent(Constant):
-        def predict(
-            self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-        ) -> Any:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
             seen.append((state, bool(episode_start.all())))
             return super().predict(observation, None, episode_start, deterministic)[0], (len(seen),)
 
@@ -71,8 +67,6 @@ def test_recurrent_egos_get_their_state_back() -> None:
 @pytest.mark.parametrize(
     ("ego", "message"),
     [
-        ("imd", "Unknown ego 'imd'"),
-        (object(), "predict"),
         (Constant([0.0, 0.0], observation_space=spaces.Box(-1, 1, (25,))), r"observations.*25.*11"),
         (Constant(0, action_space=spaces.Discrete(3)), r"Discrete\(3\).*Discrete\(5\)"),
         (Constant([0.0], action_space=spaces.Box(-1, 1, (1,))), "acceleration, steering"),
@@ -98,9 +92,7 @@ def test_wrong_x_is_refused() -> None:
 class RootOfGap(Constant):
     """A law in the square root of the gap, defined for every state that an episode shows before contact."""
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> Any:
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
         assert (observation[:, 3] >= 0.0).all()
         acceleration = 0.1 * np.sqrt(observation[:, 3])
         return np.stack([acceleration, 0.0 * acceleration], axis=1), state
@@ -155,15 +147,6 @@ def test_a_row_does_not_depend_on_its_batch(env_id: str) -> None:
     np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)
 
 
-def test_tables_of_a_result_name_the_parameters() -> None:
-    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0")
-    result = samplers.estimate(problem, "mc", gamma=2.0, seed=0, max_sim=300)
-    assert tuple(result.to_pandas().columns[-6:]) == problem.space.names
-    highway = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False)
-    assert len(highway.column_names) == highway.dim
-    assert highway.column_names[:2] == ("s[0]", "s[1]")
-
-
 class Fails(torch.nn.Module):
     """Goes straight on, but for the first row after some queries."""
 
@@ -192,9 +175,7 @@ def replay_as_on_a_gpu(ego: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @pytest.mark.parametrize("answer", [0.0, np.nan, np.inf], ids=["error", "nan", "infinite"])
 @pytest.mark.parametrize("after", [0, 99])
-def test_a_policy_that_fails_on_a_gpu_is_queried_again(
-    answer: float, after: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_that_fails_on_a_gpu_is_queried_again(answer: float, after: int, monkeypatch: Any) -> None:
     assert replay_as_on_a_gpu(Fails(answer, after), monkeypatch) is None
 
 

@@ -92,9 +92,6 @@ def test_what_it_was_fitted_to() -> None:
     assert EventCounts(used=(1,), clusters=1, cluster="event").describe() == "1 event"
 
 
-# --- refits -----------------------------------------------------------------------------------------
-
-
 def test_refits_are_distributions_of_the_same_coordinates_with_components_of_their_own() -> None:
     assert [len(refit.weights) for refit in BASE.refits if isinstance(refit, TruncatedGaussianMixture)] == [1, 2, 3]
     x = BASE.sample(50, np.random.default_rng(0))
@@ -139,12 +136,9 @@ def test_a_covering_ensemble_has_at_most_30_refits_the_first_and_the_last_among_
     assert (few.covering_ensemble().log_prob(x) == few.ensemble().log_prob(x)).all()
 
 
-def test_an_ensemble_of_plain_mixtures_or_of_nothing() -> None:
+def test_an_ensemble_of_mixtures_in_other_coordinates_or_of_nothing() -> None:
     fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 2.0))
     base = FittedDistribution(distribution=fit, refits=(fit, refit), events=COUNTS, family="1 component")
-    x = np.linspace(-3.0, 5.0, 9)[:, None]
-    mean = 0.5 * (np.exp(fit.log_prob(x)) + np.exp(refit.log_prob(x)))
-    np.testing.assert_allclose(np.exp(base.ensemble().log_prob(x)), mean, rtol=1e-9)
     with pytest.raises(ValueError, match="There are no refits"):
         replace(base, refits=()).ensemble()
     beta = BetaDistribution([2.0], [2.0], [-9.0], [9.0])
@@ -192,9 +186,6 @@ def test_siblings_are_found_by_name() -> None:
     assert found.sibling("i80") is BASE
     with pytest.raises(ValueError, match="knows no 'i80'; give an object"):
         BASE.sibling("i80")
-
-
-# --- files --------------------------------------------------------------------------------------------
 
 
 def test_a_file_comes_back() -> None:
@@ -264,9 +255,6 @@ def test_densities_add_up_and_maps_go_block_by_block() -> None:
     np.testing.assert_array_equal(u[:, 1:], x[:, 1:])
     np.testing.assert_array_equal(u[:, :1], BETA.to_standard_normal(x[:, :1]))
     np.testing.assert_allclose(both.from_standard_normal(u), x, rtol=1e-9)
-
-
-# --- with a fitted block ------------------------------------------------------------------------------
 
 
 def test_a_product_with_one_fitted_block_is_fitted_too() -> None:

@@ -43,11 +43,8 @@ def test_x_gives_everything():
     [
         ({"cutin_gap": 9.0}, r"'cutin_gap' \(did you mean 'cut_in_gap'\?\); valid are ego_speed \[0"),
         ({"ego_speed": 99}, r"ego_speed = 99 is outside its range \[0, 45\] m/s; the parameters"),
-        ({"ego_speed": np.nan}, r"ego_speed = nan is outside its range \[0, 45\] m/s"),
         ({"lead_gap": [5.0, 0.2, 5.0]}, r"lead_gap = 0.2 \(row 1\) is outside its range \[1, 150\] m"),
-        ({"lead_gap": [5.0, 6.0]}, r"lead_gap as one number or an array of shape \(3,\), got \(2,\)"),
         ({"lead_gap": "far"}, "lead_gap must be a number or an array of numbers, got 'far'"),
-        ({"lead_gap": True}, "lead_gap must be a number"),
         ({"x": [1.0, 2.0]}, r"x of shape \(n, 6\) or \(6,\), got \(2,\); its columns are ego_speed"),
         ({"x": [20, 18, 19, 15, 30, np.nan]}, "lateral_offset = nan is outside"),
         ({"x": [[20, 18, 19, 15, 30, 3]] * 2}, "x with 1 or 3 rows, one per scenario, got 2"),
@@ -58,7 +55,3 @@ def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message) as caught:
         make_space().scenario_x(options, 3, rng())
     assert "\n" not in str(caught.value)
-
-
-def test_repr_is_one_line():
-    assert repr(make_space()) == f"<ScenarioSpace of 6 parameters in 6 dimensions: {', '.join(NAMES)}>"

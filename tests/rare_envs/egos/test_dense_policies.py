@@ -1,7 +1,5 @@
 """Dense policies of Stable-Baselines3: read from models, and queried layer by layer."""
 
-import functools
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ import training
 from rare_envs.egos.dense_policies import DensePolicy, find_inference, read_dense_policy
 from rare_envs.egos.wrappers import WrappedPolicy, wrap_policy
 
-CAR_FOLLOWING = "rare_envs/CarFollowing-v0"
+CAR_FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
 
 
 class Careful(PPO):
@@ -26,19 +24,18 @@ class Careful(PPO):
         return np.full_like(action, -1.0), state
 
 
-@functools.cache
-def make(algorithm=PPO, **policy_kwargs):
-    return algorithm("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
+def make(algorithm=PPO, env_id=CAR_FOLLOWING, **policy_kwargs):
+    return algorithm("MlpPolicy", gym.make(env_id), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
 
 
 def hooked():
-    model = PPO("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu")
+    model = make()
     model.policy.action_net.register_forward_hook(lambda *_: None)
     return model
 
 
 def replaced_inside(find_part, name):
-    model = PPO("MlpPolicy", gym.make(CAR_FOLLOWING), device="cpu")
+    model = make()
     setattr(find_part(model.policy) if find_part else model, name, lambda *_, **__: None)
     return model
 
@@ -63,16 +60,9 @@ def test_other_policies_are_simulated_by_torch(ego, reason):
         rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model, core="numba")
 
 
-CUT_IN = "rare_envs/CutIn-v0"
-
-
-def make_cut_in(algorithm=PPO, **policy_kwargs):
-    return algorithm("MlpPolicy", gym.make(CUT_IN), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
-
-
 @pytest.mark.parametrize("net_arch", [[64, 64], []])
 def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arch):
-    model = make_cut_in(A2C, activation_fn=torch.nn.ReLU, net_arch=net_arch)
+    model = make(A2C, CUT_IN, activation_fn=torch.nn.ReLU, net_arch=net_arch)
     found = find_inference(model)
     assert isinstance(found, DensePolicy)
     for size in (1, 25, 4096):
@@ -83,7 +73,7 @@ def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arc
 @pytest.mark.parametrize("gain", [0.3, 5.0])
 @pytest.mark.parametrize("net_arch", [[64, 64], [256, 128, 32]])
 def test_actions_between_tangents_are_as_near_to_exact_ones_as_those_of_predict(net_arch, gain):
-    model = make_cut_in(net_arch=net_arch)
+    model = make(PPO, CUT_IN, net_arch=net_arch)
     with torch.no_grad():
         for weights in model.policy.parameters():  # from nearly linear units to nearly all at their bounds
             weights.copy_(gain * torch.randn(weights.shape, generator=torch.Generator().manual_seed(weights.numel())))
@@ -119,19 +109,19 @@ def test_wrappers_stay_around_the_layers():
 def test_statistics_that_leave_the_observations_as_they_are_are_not_applied(switched_off):
     statistics = VecNormalize(training.sb3_vec_env(CUT_IN, num_envs=2), norm_obs=switched_off)
     statistics.norm_obs = False  # with moments of the time before, or none
-    ego = WrappedPolicy(make_cut_in(), statistics.normalize_obs)
+    ego = WrappedPolicy(make(PPO, CUT_IN), statistics.normalize_obs)
     if switched_off:
         statistics.obs_rms.mean[:] = 5.0
     assert read_dense_policy(ego).normalisation is None
     x = rare_envs.DrivingProblem(CUT_IN).base.sample(20, np.random.default_rng(0))
     f, expected = (
-        rare_envs.DrivingProblem(CUT_IN, ego=each, core="numba").evaluate(x) for each in (ego, make_cut_in())
+        rare_envs.DrivingProblem(CUT_IN, ego=each, core="numba").evaluate(x) for each in (ego, make(PPO, CUT_IN))
     )
     assert np.array_equal(f, expected)
 
 
 def test_rollouts_are_those_of_predict_and_weights_are_read_for_each(monkeypatch):
-    model = make_cut_in()
+    model = make(PPO, CUT_IN)
     problem = rare_envs.DrivingProblem(CUT_IN, ego=model, core="torch", horizon=3.0)
     x = problem.base.sample(40, np.random.default_rng(0))
     first = problem.evaluate(x)

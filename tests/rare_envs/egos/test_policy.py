@@ -32,16 +32,11 @@ class Recorder:
         return np.zeros((len(observation), 2)), state
 
 
-@pytest.mark.parametrize(
-    ("ego", "message"),
-    [
-        (Recorder(dt=0.2), "Expected dt=0.2 s"),
-        (Recorder(observation_space=observation_space(2, "lidar")), "observation='lidar'"),
-    ],
-)
-def test_an_ego_for_another_tick_or_observation_is_refused(ego: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        as_driver(ego, WORLD)
+def test_an_ego_for_another_tick_or_observation_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"Expected dt=0\.2 s"):
+        as_driver(Recorder(dt=0.2), WORLD)
+    with pytest.raises(ValueError, match="observation='lidar'"):
+        as_driver(Recorder(observation_space=observation_space(2, "lidar")), WORLD)
 
 
 def test_spaces_of_actions() -> None:
@@ -218,9 +213,7 @@ def test_frames_of_spaces() -> None:
 class Echo:
     """A policy whose action is what it is shown."""
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> Any:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
         return observation, state
 
 

@@ -72,17 +72,6 @@ def test_other_roads_where_the_ego_begins_beside_the_line(env_id: str, road: Roa
     compare(compiled, reference, n=FEW, others=0.01)
 
 
-class Choices(gym.ActionWrapper):
-    """The environment with discrete actions."""
-
-    def __init__(self, env: Any) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.Discrete(len(DISCRETE_ACTIONS))
-
-    def action(self, action: Any) -> Any:
-        return DISCRETE_ACTIONS[action]
-
-
 @functools.cache
 def model(env_id: str, kind: str = "ppo") -> Any:
     """An untrained policy with outputs as large as those of a trained one."""
@@ -97,7 +86,9 @@ def model(env_id: str, kind: str = "ppo") -> Any:
         wrapped.obs_rms.mean[:], wrapped.obs_rms.var[:] = 0.3, 0.5
         made = PPO("MlpPolicy", wrapped, **given)
     elif kind == "dqn":
-        made = DQN("MlpPolicy", Choices(env), buffer_size=1, **given)
+        choices = gym.spaces.Discrete(len(DISCRETE_ACTIONS))
+        chosen = gym.wrappers.TransformAction(env, lambda action: DISCRETE_ACTIONS[action], choices)
+        made = DQN("MlpPolicy", chosen, buffer_size=1, **given)
     else:
         made = PPO("MlpPolicy", env, **given)
     with torch.no_grad():

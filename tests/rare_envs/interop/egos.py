@@ -11,10 +11,8 @@ class Always:
     def __init__(self, action: Any) -> None:
         self.action = action
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> Any:
-        return np.array([self.action]), state
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.repeat(np.array([self.action]), len(observation), axis=0), state
 
 
 def faster() -> Always:

@@ -7,20 +7,15 @@ import rare_envs
 from rare_envs.measures import Moment
 from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import State
+from tests.rare_envs.interop.egos import Always
+from tests.rare_envs.traffic_states import F64, traffic
 
-F64 = torch.float64
+COASTING = Always([0.0, 0.0])
 Vehicle = tuple[float, float, float, float]
 TIME = np.arange(0.0, 40.0, 2e-3)
 FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
 # 20 m/s behind 10 m/s at 100 m: no collision in 10 s (but at it); at 60 m after 6 s; 10 behind 20: never
 CLOSE, HIT, AWAY = (20.0, 10.0, 100.5), (20.0, 10.0, 60.5), (10.0, 20.0, 30.0)
-
-
-def traffic(*vehicles: Vehicle) -> State:
-    """One scenario; x, y, heading, speed of each vehicle."""
-    x, y, heading, speed = (torch.tensor(column, dtype=F64)[None] for column in zip(*vehicles, strict=True))
-    return State(x, y, heading, speed, x[:, :0])
 
 
 def moment(*vehicles: Vehicle, accelerations: tuple[float, ...] | None = None, lanes: int = 2) -> Moment:
@@ -49,15 +44,8 @@ def drives(rng: np.random.Generator, count: int) -> list[tuple[float, ...]]:
     return [tuple(row) for row in rng.uniform(low, high, (count, 5))]
 
 
-class Coasting:
-    """An ego that keeps its speed."""
-
-    def predict(self, observation: np.ndarray, **_: object) -> tuple[np.ndarray, None]:
-        return np.zeros((len(observation), 2), dtype=np.float32), None
-
-
 def problem(measure: object, env_id: str = FOLLOWING, **kwargs: object) -> rare_envs.DrivingProblem:
-    return rare_envs.DrivingProblem(env_id, ego=Coasting(), measure=measure, **kwargs)
+    return rare_envs.DrivingProblem(env_id, ego=COASTING, measure=measure, **kwargs)
 
 
 def f(measure: object, *x: float, **kwargs: object) -> float:

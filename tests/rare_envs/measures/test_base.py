@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.measures import MEASURES, EpisodeMeasure, Measure, Moment, find_measure, ttb, ttc
+from rare_envs.measures import MEASURES, Measure, Moment, ttb, ttc
 from rare_envs.measures.base import acceleration_of_lead
 from rare_envs.measures.longitudinal import (
     DECELERATION_MAX,
@@ -35,7 +35,7 @@ from rare_envs.measures.two_dimensional import (
 from rare_envs.traffic.bodies import Lead, lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
-from tests.rare_envs.measures.moments import F64, TIME, drives, following, moment, path, problem
+from tests.rare_envs.measures.moments import F64, TIME, drives, following, moment, path
 from tests.rare_envs.traffic_states import tensor, traffic
 
 SIDE_SWIPE = (3.5 - 1.0 - math.cos(0.05) - 2.5 * math.sin(0.05)) / (20.0 * math.sin(0.05))
@@ -136,34 +136,6 @@ def test_values_are_finite_and_keep_their_dtype_anywhere(name: str, dtype: torch
             assert torch.isfinite(value).all()
             f = MEASURES[name].f(MEASURES[name].start(now, 10))
             assert (f > MEASURES[name].collision).all() if name != "margin" else (f > 0).all()  # type: ignore[attr-defined]
-
-
-class Steps(EpisodeMeasure):
-    """Counts moments after the first."""
-
-    def start(self, moment: Moment, ticks: int) -> Tensor:
-        return torch.zeros_like(moment.state.x[:, 0])
-
-    def update(self, state: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
-        return state + 1
-
-    def f(self, state: Tensor) -> Tensor:
-        return state
-
-
-def test_a_measure_of_ones_own_needs_three_methods() -> None:
-    measure = Steps()
-    assert (measure.sees, measure.records, measure.unit) == (False, False, "")
-    assert find_measure(measure) is measure
-    assert problem(measure, horizon=2.0).evaluate(np.array([[20.0, 20.0, 50.0]])).tolist() == [20.0]
-
-
-def test_what_only_looks_like_a_measure_is_refused() -> None:
-    class Undeclared:
-        start, update, f = Steps.start, Steps.update, Steps.f
-
-    with pytest.raises(ValueError, match="Unknown measure"):
-        find_measure(Undeclared())
 
 
 @pytest.mark.parametrize("y", [0.0, 1.5, 7.0])  # in the middle, beside it, off the road

@@ -30,14 +30,8 @@ def test_measures_by_what_a_user_types(tmp_path: Path, monkeypatch: pytest.Monke
 
     np.testing.assert_array_equal(of("measures_here:gap"), of(lambda moment: moment.lead.gap))
     np.testing.assert_array_equal(of("measures_here:mine"), of(Measure(ttc, collision=-7.0)))
-    for wrong, words in (
-        ("measures_here:gpa", "nothing called 'gpa' .did you mean 'gap'"),
-        ("measures_here:number", "Unknown measure 3"),
-        ("no_such_module:gap", "Cannot import 'no_such_module'"),
-        (":gap", "Expected module:name for the measure ':gap'"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            of(wrong)
+    with pytest.raises(ValueError, match="Unknown measure 3"):
+        of("measures_here:number")
 
 
 def test_a_formula_by_what_a_user_types() -> None:

@@ -31,10 +31,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 def test_a_scenario_is_imported_when_it_is_first_asked_for_and_kept(place: str) -> None:
     registry = Registry({"a/B-v0": f"{place}:SCENARIO", "a/C-v0": f"{place}:NOTHING"})
-    assert list(registry) == ["a/B-v0", "a/C-v0"]
-    assert len(registry) == 2
-    assert "a/B-v0" in registry
-    assert "a/D-v0" not in registry
+    assert list(registry) == ["a/B-v0", "a/C-v0"] and "a/D-v0" not in registry
     assert place not in sys.modules
     scenario = registry["a/B-v0"]
     assert scenario is sys.modules.pop(place).SCENARIO
@@ -46,12 +43,7 @@ def test_a_scenario_is_imported_when_it_is_first_asked_for_and_kept(place: str) 
 
 
 def test_scenarios_by_id_and_by_name_are_the_same() -> None:
-    for env_id, name in [
-        ("rare_envs/CarFollowing-v0", "car_following"),
-        ("rare_envs/CutIn-v1", "cut_in"),
-        ("rare_envs/Highway-v0", "highway"),
-        ("rare_envs/HardBrake-v0", "hard_brake"),
-    ]:
+    for env_id, name in (("rare_envs/HardBrake-v0", "hard_brake"), ("rare_envs/CutIn-v1", "cut_in")):
         assert find_scenario(env_id) is scenario_named(name) is SCENARIOS[env_id]
         assert scenario_named(name).name == name
     with pytest.raises(ValueError, match=r"^Unknown scenario 'cutin' \(did you mean 'cut_in'\?\); there are car_foll"):

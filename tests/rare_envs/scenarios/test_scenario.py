@@ -27,9 +27,10 @@ from rare_envs.study.cli.app import app
 from rare_envs.study.cli.listing import list_names
 from rare_envs.traffic.road import ReferenceLine, Road
 from rare_envs.traffic.state import State
+from tests.rare_envs.interop.egos import Always
 from tests.rare_envs.scenarios.standing import STANDING, initial, others
+from tests.rare_envs.traffic_states import F64, traffic
 
-F64 = torch.float64
 BEND = ReferenceLine(25.0, (0.0, 0.002, 0.004, -0.002, 0.0))
 SPEED = Parameter("speed", "m/s", 5.0, 30.0, "")
 
@@ -53,16 +54,11 @@ def test_a_scenario_that_contradicts_itself_is_refused(change: dict[str, Any], e
     assert expected in str(caught.value)
 
 
-def traffic(rows: list[list[tuple[float, float, float, float]]]) -> State:
-    """Scenarios of vehicles (x, y, heading, speed)."""
-    return State(*torch.tensor(rows, dtype=F64).unbind(dim=-1), theta=torch.zeros(len(rows), 0, dtype=F64))
-
-
 EGO = (0.0, 0.0, 0.0, 99.0)
 
 
 def test_vehicles_that_keep_straight_move_by_their_speed_before_the_tick() -> None:
-    state = traffic([[EGO, (30.0, 1.0, 0.1, 20.0), (60.0, 2.0, 0.0, 1.0)]])
+    state = traffic(EGO, (30.0, 1.0, 0.1, 20.0), (60.0, 2.0, 0.0, 1.0))
     after = keep_straight(state, torch.tensor([[-2.0, -4.0]], dtype=F64), 0.5)
     assert after.x.tolist() == [[40.0, 60.5]]
     assert after.speed.tolist() == [[19.0, 0.0]]  # -1 m/s would be backwards
@@ -73,7 +69,7 @@ def test_vehicles_that_keep_straight_move_by_their_speed_before_the_tick() -> No
 
 def drive_in_the_bend(y: float, heading: float, action: Tensor, ticks: int) -> list[float]:
     """Drive a point at 20 m/s in the bend; x, y, heading and speed at the end."""
-    state, road = traffic([[EGO, (0.0, y, heading, 20.0)]]), Road((-2.0, 2.0, 5.0), BEND)
+    state, road = traffic(EGO, (0.0, y, heading, 20.0)), Road((-2.0, 2.0, 5.0), BEND)
     for _ in range(ticks):
         after = drive_points(state, action, 0.1, road)
         state = State(*(torch.cat((mine[:, :1], new), 1) for mine, new in zip(state[:4], after, strict=True)), state[4])
@@ -150,8 +146,6 @@ def test_it_is_known_everywhere(registered):
     entry = list_names()["environments"][registered]
     assert [p["name"] for p in entry["parameters"]] == ["speed", "distance"]
     assert entry["bases"] == ["even"]
-    with pytest.raises(ValueError, match="did you mean 'tests/Standing-v0'"):
-        rare_envs.make_batch("tests/Standin-v0", 2)
 
 
 def test_it_passes_the_suites(registered):
@@ -170,12 +164,7 @@ def test_it_passes_the_suites(registered):
 
 def test_its_probability_is_the_one_on_paper(registered):
     """An ego that only brakes stops within v^2 / (2 * 5): it crashes where the distance is shorter."""
-
-    class Braking:
-        def predict(self, observation, state=None, episode_start=None, deterministic=True):
-            return np.tile([-1.0, 0.0], (len(observation), 1)), None
-
-    problem = rare_envs.DrivingProblem(registered, ego=Braking())
+    problem = rare_envs.DrivingProblem(registered, ego=Always([-1.0, 0.0]))
     n = 20_000
     result = samplers.estimate(problem, samplers.MonteCarlo(), max_sim=n, seed=0)
     v = np.linspace(5.0, 30.0, 100_001)

@@ -112,9 +112,7 @@ def test_a_vehicles_own_state_and_place_in_its_lane() -> None:
         ((0.0, -8.0, math.pi / 2, 5.0), -90, 5.5, -5.0),  # comes from the left
     ],
 )
-def test_beams_are_named_by_their_angle(
-    other: tuple[float, float, float, float], angle: int, distance: float, rate: float
-) -> None:
+def test_beams_are_named_by_their_angle(other, angle: int, distance: float, rate: float) -> None:
     seen = perceived(traffic(EGO, other), straight(3))
     assert (seen[f"range_{angle}"], seen[f"rate_{angle}"]) == pytest.approx((distance, rate))
     opposite = angle + 180 if angle <= 0 else angle - 180

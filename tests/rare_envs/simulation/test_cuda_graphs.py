@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import pytest
 import torch
 
 import agents
@@ -27,9 +26,7 @@ def test_on_the_cpu_nothing_is_recorded() -> None:
     assert torch.equal(recorded(World(CUT_IN), X).f, rollout(World(CUT_IN), IDM(), X).f)
 
 
-def test_each_world_and_size_is_recorded_once_and_what_was_not_played_for_longest_goes_first(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_each_world_and_size_is_recorded_once_and_what_was_not_played_for_longest_goes_first(monkeypatch) -> None:
     """Nothing is recorded here; the places of x are there. Where memory is short, all recordings go first."""
     made: list[tuple[World, int]] = []
 

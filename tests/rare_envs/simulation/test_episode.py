@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE
-from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Clock, Measurement, World, drive, rollout
+from rare_envs.simulation.world import Clock, Measurement, World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 
@@ -39,20 +38,6 @@ def test_ticks_and_decisions() -> None:
 def test_times_that_do_not_go_together_are_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Clock(**settings)  # type: ignore[arg-type]
-
-
-def test_f_is_capped_falls_and_stays_at_minus_1() -> None:
-    world = World(CAR_FOLLOWING)
-    episode = world.start(torch.tensor([[20.0, 25.0, 30.0], [20.0, 10.0, 1.5]]))
-    assert float(episode.f[0]) == TTC_MAX
-    values = []
-    for _ in range(6):
-        episode = world.step(episode, torch.zeros(2, 2))
-        values.append(float(episode.f[1]))
-    assert values[0] > 0.0
-    assert values[1:] == [-1.0] * 5
-    assert episode.collided.tolist() == [False, True]
-    assert float(episode.f[0]) == TTC_MAX
 
 
 def test_the_least_time_to_collision_is_kept_whatever_the_measure() -> None:
@@ -103,11 +88,6 @@ def test_a_crash_of_others_does_not_hide_that_of_the_ego() -> None:
 X = torch.tensor([[20.0, 20.0, 60.0]])
 
 
-class Coasting:
-    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        return torch.zeros(len(episode.collided), 2), (memory or 0) + 1
-
-
 @dataclass(frozen=True)
 class Shaken:
     """A driver whose acceleration is its noise."""
@@ -122,12 +102,6 @@ class Shaken:
         assert self.draws is not None
         tick = memory or 0
         return torch.stack((self.draws[:, tick], torch.zeros(len(self.draws))), dim=1), tick + 1
-
-
-def test_one_moment_at_time_0_and_one_after_each_tick() -> None:
-    episodes = list(drive(World(CAR_FOLLOWING, clock=Clock(horizon=0.5)), Coasting(), X))
-    assert len(episodes) == 6
-    assert [float(each.state.x[0, 0]) for each in episodes] == pytest.approx([2.0 * k for k in range(6)])
 
 
 def test_the_last_columns_of_x_are_the_egos_noise() -> None:

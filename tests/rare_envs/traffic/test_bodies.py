@@ -88,11 +88,7 @@ def test_time_to_contact_is_when_small_steps_in_time_first_touch(scenes: np.ndar
         if math.isfinite(first):
             assert first - 0.01 - 1e-9 <= time <= first + 1e-9
         elif math.isfinite(time) and time < 2.99:  # a touch so short that it falls between two steps
-            assert overlap(*bodies(scene, time + 1e-7)) or separation_at(scene, time) < 1e-9
-
-
-def separation_at(scene: np.ndarray, time: float) -> float:
-    return nearest(*bodies(scene, time))[0]
+            assert overlap(*bodies(scene, time + 1e-7)) or nearest(*bodies(scene, time))[0] < 1e-9
 
 
 def test_overlap_is_a_negative_separation() -> None:

@@ -12,6 +12,7 @@ import rare_envs
 from rare_envs.traffic.bodies import overlaps
 from rare_envs.traffic.crash import CRASH_KINDS, crash_of, crash_of_others, describe_crash, injury_risk
 from rare_envs.traffic.road import straight
+from tests.rare_envs.measures.moments import COASTING
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
 from tests.rare_envs.traffic_states import F64, traffic
 
@@ -83,9 +84,7 @@ def test_injury_risk_is_the_published_curve() -> None:
     assert injury_risk(torch.linspace(0.0, 40.0, 50)).diff().min() > 0
 
 
-def driven(
-    x: np.ndarray, y: np.ndarray, heading: np.ndarray, vx: np.ndarray, vy: np.ndarray, time: float
-) -> list[np.ndarray]:
+def driven(x, y, heading, vx, vy, time):
     """Bodies that drive straight."""
     return [corners(*pose) for pose in zip(x + vx * time, y + vy * time, heading, strict=True)]
 
@@ -127,11 +126,6 @@ def test_the_first_contact_is_found_as_small_steps_find_it() -> None:
     assert seen == {"rear_end", "rear_ended", "side"}
 
 
-class Coasting:
-    def predict(self, observation: np.ndarray, **_: object) -> tuple[np.ndarray, None]:
-        return np.zeros((len(observation), 2), dtype=np.float32), None
-
-
 # the cutter, at 30 m/s 30 m behind a lead at 5 m/s, cannot stop; the ego is 60 m away
 OTHERS_ONLY = (6.0, 30.0, 5.0, 60.0, 30.0, 2.3)
 INTO_CUTTER = (35.0, 15.0, 20.0, 60.0, 40.0, 2.3)
@@ -139,7 +133,7 @@ INTO_CUTTER = (35.0, 15.0, 20.0, 60.0, 40.0, 2.3)
 
 def test_collisions_between_others_count_if_asked_for() -> None:
     x = np.array([OTHERS_ONLY, INTO_CUTTER])
-    assert (rare_envs.DrivingProblem(CUT_IN, ego=Coasting(), collisions="any").evaluate(x) == -1).all()
+    assert (rare_envs.DrivingProblem(CUT_IN, ego=COASTING, collisions="any").evaluate(x) == -1).all()
     with pytest.raises(ValueError, match="'ego' or 'any'"):
         rare_envs.DrivingProblem(CUT_IN, collisions="others")
     for collisions, terminates in (("ego", False), ("any", True)):
@@ -155,7 +149,7 @@ def test_collisions_between_others_count_if_asked_for() -> None:
 
 
 def test_info_of_a_batch_says_the_same_as_a_problem() -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=Coasting())
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=COASTING)
     x = problem.base.sample(5, np.random.default_rng(3))
     x[:2], x[2, :4], x[4] = (OTHERS_ONLY, INTO_CUTTER), (32.0, 15.0, 14.0, 6.0), (10.0, 20.0, 25.0, 30.0, 30.0, 3.0)
     expected = [describe_crash(problem.crashes(x), row) for row in range(5)]

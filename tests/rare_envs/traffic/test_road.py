@@ -54,9 +54,8 @@ def test_curve_has_the_curvature_of_its_knots_and_is_straight_elsewhere() -> Non
     s = torch.tensor([-1e3, -1.0, 0.0, 12.5, 25.0, 50.0, 62.5, 75.0, 100.0, 101.0, 1e4], dtype=F64)
     wanted = [0, 0, 0, 0.001, 0.002, 0.004, 0.001, -0.002, 0, 0, 0]
     torch.testing.assert_close(BEND.curvature(s), torch.tensor(wanted, dtype=F64))
-    before, start, end, after = BEND.reference_line.at(
-        torch.tensor([-500.0, 0.0, 100.0, 2e3], dtype=F64)
-    ).heading.tolist()
+    places = torch.tensor([-500.0, 0.0, 100.0, 2e3], dtype=F64)
+    before, start, end, after = BEND.reference_line.at(places).heading.tolist()
     assert (before, start) == (0.0, 0.0)
     assert after == end == pytest.approx(0.004 * 25)  # the sum of the curvatures at the knots times their spacing
 
@@ -67,9 +66,7 @@ def test_a_place_that_is_nan_has_no_point_where_nobody_can_look(monkeypatch: pyt
     assert line is not None
     s = torch.tensor([10.0, torch.nan, 40.0])
     point = line.at(s)
-    assert (
-        point.x.isnan().tolist() == point.y.isnan().tolist() == point.heading.isnan().tolist() == [False, True, False]
-    )
+    assert all(field.isnan().tolist() == [False, True, False] for field in (point.x, point.y, point.heading))
     torch.testing.assert_close(point.x[::2], line.at(s[::2]).x, rtol=0, atol=0)
 
 
