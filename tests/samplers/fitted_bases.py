@@ -102,6 +102,13 @@ class HalfSpace:
         return self.beta - x[:, 0] + self.tilt * x[:, 1]
 
 
+SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]
+"""30 refits with a spread of log p of about 1.2."""
+FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
+"""The same with four that no point of a run under N(0, 1) reaches."""
+BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
+
+
 @functools.cache
 def run(base, method="two-stage", seed=1, max_sim=3000, **options):
     return samplers.estimate(HalfSpace(base), method, seed=seed, max_sim=max_sim, **options)

@@ -115,7 +115,7 @@ def test_counts_are_within_one_of_their_expectation(weights, n, seed):
     assert (np.abs(counts - n * weights / weights.sum()) < 1 + 1e-6).all()
 
 
-def vmfn(dim, kappa=8.0):
+def vmfn(dim, kappa):
     mu = np.arange(1.0, dim + 1)
     return VonMisesFisherNakagami(mu / np.linalg.norm(mu), kappa, 3.0, 16.0)
 

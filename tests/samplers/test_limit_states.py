@@ -1,25 +1,18 @@
 import numpy as np
 import pytest
 
-from samplers.limit_states import (
-    four_branches,
-    half_space,
-    parabola,
-    plateau,
-    shell,
-    two_modes,
-)
+from samplers.limit_states import four_branches, half_space, parabola, plateau, shell, two_modes
 
 
 @pytest.mark.parametrize(
     "reference",
     [
-        half_space(3, beta=1.5),
+        half_space(3, 1.5),
         two_modes(distance=0.8),
-        parabola(beta=1.0),
+        parabola(1.0),
         four_branches(k=1.8),
         plateau(beta=1.5),
-        shell(5, p=0.05),
+        shell(5, 0.05),
     ],
     ids=lambda r: r.name,
 )

@@ -48,19 +48,12 @@ class ParametricNormal:
 
     def parameters(self, names=(), like=None):
         names = names or [f"x{j + 1}" for j in range(len(self.mean))]
-        means = [
-            NormalParameter(f"mean of {name}", value, sd, "1 sd", (j,))
-            for j, (name, value, sd) in enumerate(zip(names, self.mean, self.sd, strict=True))
-        ]
-        sds = [
-            NormalParameter(f"sd of {name}", sd, 0.1 * sd, "10 %", (j,))
-            for j, (name, sd) in enumerate(zip(names, self.sd, strict=True))
-        ]
-        return (*means, *sds)
+        rows = list(enumerate(zip(names, self.mean, self.sd, strict=True)))
+        means = (NormalParameter(f"mean of {name}", mean, sd, "1 sd", (j,)) for j, (name, mean, sd) in rows)
+        return (*means, *(NormalParameter(f"sd of {name}", sd, 0.1 * sd, "10 %", (j,)) for j, (name, _, sd) in rows))
 
     def with_parameters(self, values):
-        mean, sd = np.split(np.asarray(values), 2)
-        return ParametricNormal(mean, sd)
+        return ParametricNormal(*np.split(np.asarray(values), 2))
 
 
 class HalfSpace:
@@ -68,10 +61,9 @@ class HalfSpace:
 
     def __init__(self, base, beta=BETA):
         self.base, self.dim, self.beta = base, len(base.mean), beta
-        self.mean, self.sd = base.mean, base.sd
 
     def evaluate(self, x):
-        return self.beta - ((x - self.mean) / self.sd) @ ALPHA
+        return self.beta - self.base.to_standard_normal(x) @ ALPHA
 
 
 BASE = ParametricNormal([10.0, -2.0, 0.0], [4.0, 0.5, 1.0])
@@ -85,8 +77,7 @@ def fitted(n_refits=30, seed=0, components=None):
     """Return the base with refits of which only the first column's mean and the second's sd vary."""
     rng = np.random.default_rng(seed)
     base = ParametricNormal(BASE.mean, BASE.sd)
-    values = np.array([each.value for each in base.parameters()])
-    changes = np.array([each.change for each in base.parameters()])
+    values, changes = (np.array([each[k] for each in base.parameters()]) for k in (1, 2))
     refits = []
     for _ in range(n_refits):
         move = np.zeros(6)

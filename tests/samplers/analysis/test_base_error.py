@@ -9,15 +9,21 @@ import pytest
 from scipy import stats
 
 import samplers
-from tests.samplers.fitted_bases import BETA, FittedWithEnsemble, HalfSpace, fitted, normal, run
+from tests.samplers.fitted_bases import (
+    BASE,
+    BETA,
+    FAR,
+    FAR_BASE,
+    SHIFTED,
+    FittedWithEnsemble,
+    HalfSpace,
+    fitted,
+    normal,
+    run,
+)
 
 WIDE = [normal(mean, sd) for mean in np.linspace(-2.0, 2.0, 6) for sd in (0.5, 0.75, 1.0, 1.5, 2.0)]
 """30 refits so far apart that the events determine nothing."""
-SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]
-"""30 refits with a spread of log p of about 1.2."""
-FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
-"""The same with four that no point of a run under N(0, 1) reaches."""
-BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
 
 
 def after(result, lineages):
@@ -134,13 +140,11 @@ def test_a_further_run_is_made_exactly_where_the_points_do_not_reach_the_refits(
     three = run(fitted([*SHIFTED[:27], *FAR[27:]], FittedWithEnsemble))
     assert sum(ess < 10 for ess in three.base_uncertainty.ess_refits) == 3
     assert three.ensemble_run is None
-    four = run(FAR_BASE)
-    assert four.ensemble_run is not None
+    assert run(FAR_BASE).ensemble_run is not None
 
 
 def test_the_further_run_knows_p_of_the_refits_and_leaves_p_as_it_is():
-    base = FAR_BASE
-    result, without = run(base), run(base, ensemble_run=False)
+    result, without = run(FAR_BASE), run(FAR_BASE, ensemble_run=False)
     assert without.ensemble_run is None
     assert (result.p, result.interval, result.n_sim) == (without.p, without.interval, without.n_sim)
     found = result.base_uncertainty

@@ -73,7 +73,13 @@ def test_expectations_under_refits_are_those_of_the_tail():
 
 
 def test_bad_input_is_refused():
-    failures = weigh_failures(estimate_half_space())
+    result = estimate_half_space()
+    failures = weigh_failures(result)
+    for values in (failures.x, np.full(len(failures.x), np.nan), np.full(len(failures.x), np.inf)):
+        with pytest.raises(ValueError, match="Expected a number for each of"):
+            compute_exceedance(result, failures, values, [1.0])
+    with pytest.raises(ValueError, match="Expected finite thresholds"):
+        compute_exceedance(result, failures, failures.x[:, 0], [np.inf])
     for values in (-failures.x[:, 0], failures.x, np.full(len(failures.x), np.nan)):
         with pytest.raises(ValueError, match="finite value >= 0 for each"):
             expect_over_failures(failures, values)
@@ -162,16 +168,6 @@ def test_the_comparison_is_strict_and_points_without_a_value_never_count():
     assert ties.p.tolist() == [pytest.approx(result.p), 0.0, 0.0]
     none = compute_exceedance(result, failures, np.full(len(failures.x), -np.inf), [-1e300, 0.0])
     assert none.p.tolist() == [0.0, 0.0]
-
-
-def test_values_without_a_number_and_thresholds_that_are_none_are_refused():
-    result = estimate_half_space()
-    failures = weigh_failures(result)
-    for values in (failures.x, np.full(len(failures.x), np.nan), np.full(len(failures.x), np.inf)):
-        with pytest.raises(ValueError, match="Expected a number for each of"):
-            compute_exceedance(result, failures, values, [1.0])
-    with pytest.raises(ValueError, match="Expected finite thresholds"):
-        compute_exceedance(result, failures, failures.x[:, 0], [np.inf])
 
 
 def test_one_threshold_has_the_interval_that_refits_allow_and_several_have_a_wider_band():

@@ -84,18 +84,12 @@ def test_it_is_as_often_wrong_as_it_says() -> None:
     assert sum(counts) > 0  # and they are not idle: about 8 % of 200
 
 
-def test_no_failure_passes_where_the_sample_is_large_enough() -> None:
-    """0 of n passes a limit of 1 - 0.05^(1/n), 1.5e-3 for 2,000, and no less."""
-    problem = samplers.FunctionProblem(lambda x: x[:, 0] + 9.0, dim=1)
-    result = samplers.estimate(problem, "mc", seed=0, max_sim=2000, confidence=0.9)
-    limit = 1 - 0.05 ** (1 / 2000)
-    assert result.meets(1.001 * limit) and not result.meets(0.999 * limit)
-
-
-def test_no_failure_of_a_search_is_worth_its_base_draws_alone() -> None:
+@pytest.mark.parametrize("method", ["mc", "two-stage"])
+def test_no_failure_passes_where_base_draws_are_enough(method: str) -> None:
+    """0 of n passes a limit of 1 - 0.05^(1/n), and no less; n are the base draws alone of a search."""
     problem = samplers.FunctionProblem(lambda x: x[:, 0] + 50.0, dim=1)
-    result = samplers.estimate(problem, seed=0, max_sim=3000, confidence=0.9)
-    assert result.p == 0.0 and 0 < result.base_draws
+    result = samplers.estimate(problem, method, seed=0, max_sim=2000, confidence=0.9)
+    assert result.p == 0.0 and 0 < result.base_draws and (result.base_draws == 2000) == (method == "mc")
     limit = 1 - 0.05 ** (1 / result.base_draws)
     assert result.meets(1.001 * limit) and not result.meets(0.999 * limit)
 

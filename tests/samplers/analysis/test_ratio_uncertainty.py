@@ -10,11 +10,7 @@ from scipy import stats
 import samplers
 from samplers.analysis.base_error import summarise_refits
 from samplers.analysis.reweight import RefitSums
-from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal
-
-SHIFTED = [normal(mean) for mean in np.linspace(-0.6, 0.6, 30)]
-FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
-BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
+from tests.samplers.fitted_bases import BASE, FAR, FAR_BASE, SHIFTED, HalfSpace, normal
 
 
 def exact_ratios(refits, betas=(3.0, 3.3)):
@@ -24,8 +20,7 @@ def exact_ratios(refits, betas=(3.0, 3.3)):
 
 def test_two_sides_of_one_run():
     """`compare` takes both from the same draws: the same refits, another error of the run."""
-    base = BASE
-    found = samplers.compare(HalfSpace(base, 3.0), HalfSpace(base, 3.3), seed=2, max_sim=6000)
+    found = samplers.compare(HalfSpace(BASE, 3.0), HalfSpace(BASE, 3.3), seed=2, max_sim=6000)
     ratio = found.base_uncertainty
     assert np.log(ratio.value_refits) == pytest.approx(np.log(exact_ratios(SHIFTED)), abs=0.25)
     assert ratio.value == found.ratio == pytest.approx(exact_ratios([normal()])[0], rel=0.1)
@@ -46,14 +41,14 @@ def test_the_further_run_of_a_comparison_simulates_both():
             rows.append(len(x))
             return super().evaluate(x)
 
-    base = FAR_BASE
-    found = samplers.compare(Counting(base, 3.0), Counting(base, 3.3), seed=2, max_sim=6000)
+    both = Counting(FAR_BASE, 3.0), Counting(FAR_BASE, 3.3)
+    found = samplers.compare(*both, seed=2, max_sim=6000)
     assert found.n_sim + found.base_uncertainty.n_sim == sum(rows)
     assert 0 < found.n_sim <= 6000
     assert 0 < found.base_uncertainty.n_sim <= 6000
     assert np.log(found.base_uncertainty.value_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
     assert f"{found.base_uncertainty.n_sim:,} simulations under their mixture" in str(found)
-    forbidden = samplers.compare(Counting(base, 3.0), Counting(base, 3.3), seed=2, max_sim=6000, ensemble_run=False)
+    forbidden = samplers.compare(*both, seed=2, max_sim=6000, ensemble_run=False)
     assert forbidden.base_uncertainty.n_sim == 0
     assert "rest on under 10" in forbidden.base_uncertainty.warnings[0]
 
@@ -67,8 +62,7 @@ def test_the_interval_of_a_comparison_holds_that_of_its_sampling():
 
 
 def test_one_that_never_fails_leaves_no_interval():
-    base = BASE
-    found = samplers.compare(HalfSpace(base, 2.0), HalfSpace(base, 9.0), "mc", seed=2, max_sim=2000).base_uncertainty
+    found = samplers.compare(HalfSpace(BASE, 2.0), HalfSpace(BASE, 9.0), "mc", seed=2, max_sim=2000).base_uncertainty
     assert found.interval is None
     assert found.reason == "one of the two never failed."
     assert str(found) == "base distribution  no interval: one of the two never failed."
@@ -76,13 +70,12 @@ def test_one_that_never_fails_leaves_no_interval():
 
 
 def test_ratios_that_the_events_do_not_determine():
-    base = BASE
     log_p = np.stack([np.linspace(-20.0, -1.0, 30), np.full(30, -5.0)])
-    found = summarise_refits(2.0, 0.1, 0.95, base, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
+    found = summarise_refits(2.0, 0.1, 0.95, BASE, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert found.interval is None
     assert found.spread == pytest.approx(log_p[0].std(ddof=1))
     assert "the events do not determine the ratio: the spread of its logarithm is 5." in str(found)
     log_p[1, 3] = -np.inf
-    unknown = summarise_refits(2.0, 0.1, 0.95, base, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
+    unknown = summarise_refits(2.0, 0.1, 0.95, BASE, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert unknown.reason.startswith("1 of 30 refits have no density")
     assert math.isnan(unknown.spread)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,8 +63,7 @@ def test_a_path_of_a_chain_counts_once():
 
 
 def test_the_decision_needs_points_and_an_ensemble():
-    covered, far = resampled(400), [normal(7.0, 0.3)] * 30
-    assert not needs_ensemble_run(run(fitted(covered, FittedWithEnsemble)))
+    far = [normal(7.0, 0.3)] * 30
     result = run(fitted(far, FittedWithEnsemble), ensemble_run=False)
     assert needs_ensemble_run(result)
     assert not needs_ensemble_run(replace(result, sample=None))
@@ -87,46 +87,20 @@ def test_a_part_that_the_points_do_not_reach_asks_for_a_further_run():
     assert not needs_ensemble_run(result, shares(-9.0, 9.0))  # another run would have as few in the second part
 
 
-class Cut:
-    """N(0, 1) in both coordinates, x_1 cut to x_1 <= 1."""
-
-    def log_prob(self, x):
-        return np.where(x[:, 0] <= 1.0, normal().log_prob(x), -np.inf)
-
-
-class Wider(Cut):
-    """Density everywhere that the base has it, draws beyond."""
-
-    def log_prob(self, x):
-        return normal().log_prob(x)
-
-    def sample(self, n, rng):
-        return np.full((n, 2), np.nan)
-
-
-class Nowhere:
-    """NaN."""
-
-    def log_prob(self, x):
-        return np.full(len(x), np.nan)
-
-
-class Other:
-    """Three dimensions."""
-
-    dim = 3
-
-    def log_prob(self, x):
-        return stats.norm.logpdf(x).sum(axis=1)
+density = normal().log_prob
+CUT = SimpleNamespace(log_prob=lambda x: np.where(x[:, 0] <= 1.0, density(x), -np.inf))
+WIDER = SimpleNamespace(log_prob=density, sample=lambda n, rng: np.full((n, 2), np.nan))
+NOWHERE = SimpleNamespace(log_prob=lambda x: np.full(len(x), np.nan))
+OTHER = SimpleNamespace(dim=3, log_prob=lambda x: stats.norm.logpdf(x).sum(axis=1))
 
 
 @pytest.mark.parametrize(
     ("refit", "text"),
     [
-        (Cut(), "Refit 2 of 2 has another support"),
-        (Wider(), "Refit 2 of 2 has another support"),
-        (Nowhere(), "Refit 2 of 2 has another support"),
-        (Other(), "Refit 2 of 2 does not fit its base distribution: Expected a distribution in 2 dimensions, got .* 3"),
+        (CUT, "Refit 2 of 2 has another support"),
+        (WIDER, "Refit 2 of 2 has another support"),
+        (NOWHERE, "Refit 2 of 2 has another support"),
+        (OTHER, "Refit 2 of 2 does not fit its base distribution: Expected a distribution in 2 dimensions, got .* 3"),
         ("us101", "Refit 2 of 2 does not fit .* log_prob, got 'us101'"),
     ],
 )
