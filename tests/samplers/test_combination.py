@@ -76,16 +76,14 @@ def test_pooled_counts_weigh_draws_not_runs():
     assert combine([few, replace(many, counts=None)], 0.95).p == pytest.approx((1 / 100 + 3 / 900) / 2)
 
 
-def sample(f, weights, first_x, n_units=None):
-    f = np.array(f, dtype=float)
-    n_units = len(f) if n_units is None else n_units
-    x = first_x + np.arange(np.count_nonzero(f <= 0), dtype=float)[:, None]
+def sample(f, weights, n_units, *x):
+    f, x = np.array(f, dtype=float), np.array(x)[:, None]
     return Sample(f=f, weights=np.array(weights), units=np.arange(len(f)), n_units=n_units, x=x)
 
 
 def test_samples_are_merged_as_the_runs_are():
-    one = outcome(0.3, sample=sample([-1.0, 2.0], [0.3, 0.7], 10.0, n_units=4))
-    two = outcome(0.1, sample=sample([3.0, -2.0, 0.0], [0.9, 0.06, 0.04], 20.0))
+    one = outcome(0.3, sample=sample([-1.0, 2.0], [0.3, 0.7], 4, 10.0))
+    two = outcome(0.1, sample=sample([3.0, -2.0, 0.0], [0.9, 0.06, 0.04], 3, 20.0, 21.0))
     merged = combine([one, two], 0.95).sample
     np.testing.assert_array_equal(merged.f, [-1, 2, 3, -2, 0])
     np.testing.assert_allclose(merged.weights, [0.15, 0.35, 0.45, 0.03, 0.02])

@@ -18,8 +18,6 @@ SLOW_CHECKS = (check_accuracy, check_budget, check_dimensions, check_interruptio
 
 
 ALL = sorted(set(METHODS) - {"auto"})  # "auto" is another of them; those of other packages too
-
-
 SLOW = pytest.mark.slow
 WHOLE = [pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALL]
 """Kriging takes seconds of its own: one estimate of it stands among the quick tests."""
@@ -59,9 +57,7 @@ def test_settings_out_of_range_are_named(kind, settings):
         kind(**settings)
 
 
-@pytest.mark.parametrize(
-    "check", [pytest.param(check, marks=pytest.mark.slow if check in SLOW_CHECKS else ()) for check in METHOD_CHECKS]
-)
+@pytest.mark.parametrize("check", [pytest.param(each, marks=[SLOW] * (each in SLOW_CHECKS)) for each in METHOD_CHECKS])
 def test_does_what_every_method_must_do(method, check):
     check(method)
 
@@ -128,8 +124,7 @@ def test_any_outcome_with_any_budget(method, outcome, max_sim):
     f, p = OUTCOMES[outcome]
     result = samplers.estimate(FunctionProblem(f, 1), method, seed=4, max_sim=max_sim, on_error="bound")
     low, high = result.interval
-    assert 0 <= low <= result.p <= high <= 1
-    assert high > 0
+    assert 0 <= low <= result.p <= high <= 1 and high > 0
     assert result.n_sim <= max_sim
     assert low / 1.3 <= p <= 1.3 * high
     assert low == 0 or outcome != "NaN"  # nothing is known to fail
