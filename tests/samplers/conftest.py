@@ -55,8 +55,12 @@ class Study:
     @property
     def own_cov(self) -> float:
         """The median of the finite c.o.v.: a run without a failure has none, and would make a mean infinite."""
-        covs = np.array([result.cov for result in self.results])
-        return float(np.median(covs[np.isfinite(covs)]))
+        return float(np.median([result.cov for result in self.results if np.isfinite(result.cov)]))
+
+    @property
+    def spread(self) -> float:
+        """The standard deviation of the ratios of the runs with a finite c.o.v., which `own_cov` describes."""
+        return float(self.ratios[[bool(np.isfinite(result.cov)) for result in self.results]].std(ddof=1))
 
     def check(self, bias: float = 0.0, confidence: float = 0.90) -> None:
         """Check mean (within four standard errors and a bias) and coverage (by chance lower in 1 of 1,000 studies)."""

@@ -63,8 +63,7 @@ def test_numbers_of_numpy_are_numbers():
         PROBLEM, method, gamma=np.float32(2.0), confidence=np.float32(0.5), seed=np.int64(1), replicates=np.int8(2)
     )
     assert result.n_sim == 1000
-    settings = json.loads(result.to_json())["method"]["settings"]
-    assert (settings["n"], settings["batch"]) == (500, 100)
+    assert json.loads(result.to_json())["method"]["settings"] == {"n": 500, "batch": 100}
 
 
 def test_a_drawn_seed_repeats_the_run():

@@ -15,8 +15,6 @@ KERNELS = {
     "metropolis, uniform": Kernel("uniform", 1.0),
     "metropolis, normal": Kernel("normal", 2.5),
 }
-
-
 PROBLEM = FunctionProblem(lambda u: -u[:, 0], dim=2)
 
 

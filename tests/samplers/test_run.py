@@ -126,8 +126,7 @@ def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recor
 
 def test_target_cov_adds_runs_until_it_is_met():
     result = samplers.estimate(half_space().problem, "adss", seed=1, target_cov=0.12)
-    assert result.cov <= 0.12
-    assert result.status == "converged"
+    assert result.cov <= 0.12 and result.status == "converged"
     assert max(level.run for level in result.trace) + 1 >= 5
     enough = samplers.estimate(half_space().problem, "adss", seed=1, target_cov=0.5)
     assert {level.run for level in enough.trace} == {0}
@@ -135,10 +134,8 @@ def test_target_cov_adds_runs_until_it_is_met():
 
 def test_target_cov_keeps_to_the_budget_and_says_so(recorder):
     f = recorder(half_space().problem.f)
-    problem = samplers.FunctionProblem(f, 2)
-    result = samplers.estimate(problem, "adss", seed=1, target_cov=0.05, max_sim=12_000)
-    assert f.rows == result.n_sim <= 12_000
-    assert result.status == "budget"
+    result = samplers.estimate(samplers.FunctionProblem(f, 2), "adss", seed=1, target_cov=0.05, max_sim=12_000)
+    assert f.rows == result.n_sim <= 12_000 and result.status == "budget"
     assert any("target c.o.v. 0.05 was not met" in text for text in result.remarks)
     assert not any("target" in text for text in result.warnings)  # less precise than wished is no doubt
 

@@ -84,12 +84,9 @@ def test_points_without_an_outcome_are_a_kind_of_their_own():
     assert sum(share.p for share in shares.values()) == pytest.approx(result.p)
 
 
-def test_nothing_failed_no_shares():
+def test_nothing_failed_no_shares_and_labels_that_are_no_words_are_refused():
     problem = samplers.FunctionProblem(lambda x: np.ones(len(x)), 2)
     assert samplers.estimate(problem, "mc", max_sim=100, seed=0).shares(side) == {}
-
-
-def test_labels_that_are_no_words_are_refused():
     for label in (lambda x: ["east"], lambda x: range(len(x))):
         with pytest.raises(ValueError, match="Expected a word for each"):
             run("mc", max_sim=30_000).shares(label)
