@@ -57,25 +57,6 @@ COMMANDS = {
 }
 
 
-EGO_MODULE = """
-import numpy as np
-
-class Braking:
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        return np.tile(np.float32([-0.2, 0.0]), (len(observation), 1)), None
-"""
-
-
-@pytest.fixture(scope="module")
-def zip_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy saved by Stable-Baselines3 that has seen hardly anything."""
-    from stable_baselines3 import PPO
-
-    path = tmp_path_factory.mktemp("ego") / "ppo.zip"
-    PPO("MlpPolicy", training.sb3_vec_env(CUT_IN, num_envs=4), n_steps=4, batch_size=16, seed=0).learn(16).save(path)
-    return path
-
-
 # ---- environments
 
 
@@ -203,33 +184,6 @@ def test_noise_is_part_of_x_or_fixed_or_absent() -> None:
 def test_egos_by_name(name: str, env_id: str) -> None:
     problem = rare_envs.DrivingProblem(env_id, ego=agents.load_ego(name), horizon=1.0)
     assert np.all(np.isfinite(problem.evaluate(problem.base.sample(2, np.random.default_rng(0)))))
-
-
-def f_of(ego: Any) -> Any:
-    """Return f of an ego in four scenarios, as far as two seconds."""
-    problem = rare_envs.DrivingProblem(CUT_IN, ego=ego, core="torch", horizon=2.0)
-    return problem.evaluate(problem.base.sample(4, np.random.default_rng(0)))
-
-
-def test_egos_from_files_and_functions(zip_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    zip_path.with_name("own_ego.py").write_text(EGO_MODULE)
-    monkeypatch.syspath_prepend(zip_path.parent)
-    for ego in (agents.load_ego("own_ego:Braking"), agents.load_ego(zip_path, algo="ppo")):
-        assert np.all(np.isfinite(f_of(ego)))
-
-
-@pytest.mark.slow
-def test_an_onnx_file_drives_as_the_zip(zip_path: Path) -> None:
-    onnx = zip_path.with_suffix(".onnx")
-    code, _, err = run("export-ego", zip_path, onnx)
-    assert code == 0, err
-    assert f_of(agents.load_ego(onnx)) == pytest.approx(f_of(agents.load_ego(zip_path)), rel=1e-3)
-
-
-@pytest.mark.parametrize("spec", ["nobody", "missing.zip", "missing.onnx", "no_module_of_that_name:make"])
-def test_unknown_egos_are_named(spec: str) -> None:
-    with pytest.raises((ValueError, FileNotFoundError), match=spec.partition(":")[0]):
-        agents.load_ego(spec)
 
 
 # ---- samplers

@@ -39,8 +39,6 @@ def test_learned_drivers_are_egos_by_name_and_by_file(tmp_path: Path, monkeypatc
         load_ego("owm.safetensors")
     with pytest.raises(ValueError, match=r"algo for a Stable-Baselines3 \.zip only, got 'ppo' for 'mgail'"):
         load_ego("mgail", algo="ppo")
-    with pytest.raises(ValueError, match=r"Expected stats for a Stable-Baselines3 \.zip only"):
-        load_ego("idm", stats="vecnormalize.pkl")
 
 
 UNKNOWN = {

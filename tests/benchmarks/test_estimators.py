@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-import samplers
 from benchmarks.estimators import against_truth
-from benchmarks.estimators.against_truth import TruthComparison, side_by_side
+from benchmarks.estimators.against_truth import TruthComparison
 from benchmarks.estimators.highway import gains
 from benchmarks.estimators.highway import truth as highway_truth
 from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS, HighwayCase
@@ -97,14 +96,6 @@ def test_rows_of_one_method_or_environment_are_made_anew_and_the_others_stay(
     calls.clear()
     against_truth.main(seeds=2, env="CutIn", method="mc", out=tmp_path / "one.json")
     assert {env_id for env_id, _ in calls} == {"rare_envs/CutIn-v0"}
-
-
-def test_runs_side_by_side_are_those_of_estimate() -> None:
-    problem = samplers.FunctionProblem(lambda u: 2.0 - u[:, 0], dim=2)
-    method = samplers.AdaptiveSubsetSimulation(n=300)
-    runs = [samplers.Run(problem, method, samplers.RunArguments(seed=seed)) for seed in range(2)]
-    alone = [samplers.estimate(problem, method, seed=seed) for seed in range(2)]
-    assert [run.p for run in side_by_side(problem, runs)] == [run.p for run in alone]
 
 
 HIGHWAY_RUNS: list[dict[str, Any]] = [

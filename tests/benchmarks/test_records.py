@@ -32,14 +32,6 @@ class Maker:
             yield {"key": job, "value": 1.0 / float(job)}
 
 
-def test_only_missing_runs_are_made_and_all_come_in_their_order(tmp_path: Path) -> None:
-    maker = Maker()
-    lines_of(tmp_path).complete(["3", "1"], maker)
-    runs = lines_of(tmp_path).complete(["1", "2", "3"], maker)
-    assert [run["key"] for run in runs] == ["1", "2", "3"]
-    assert maker.made == ["3", "1", "2"]
-
-
 def test_a_torn_line_is_made_again_and_a_stop_keeps_what_was_made(tmp_path: Path) -> None:
     def stop(jobs):
         yield from Maker()(jobs[:1])

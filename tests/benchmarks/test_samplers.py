@@ -55,31 +55,32 @@ def test_probabilities_against_monte_carlo():
         assert share == pytest.approx(state.p, abs=4 * np.sqrt(state.p / n)), name
 
 
+def estimate_by_draws(f, dim, scale, n, seed):
+    """Return the mean of n terms whose expectation is p, by weighted draws of N(0, scale^2 I), and its error."""
+    u = scale * np.random.default_rng(seed).standard_normal((n, dim))
+    log_weights = dim * np.log(scale) - 0.5 * (1 - scale**-2) * (u**2).sum(axis=1)
+    terms = np.where(f(u) <= 0, np.exp(log_weights), 0.0)
+    return terms.mean(), terms.std() / n**0.5
+
+
 def test_public_probabilities_against_wide_draws():
-    """Draws of N(0, s^2), weighted; the c.o.v. of the mean is checked to be small enough for the comparison."""
+    """The c.o.v. of the mean is checked to be small enough for the comparison."""
     for name, public in PUBLIC_STATES.items():
         state = public.state
         sd = 1.0 if state.p > 1e-2 else 1.05 if state.dim > 9 else 1.4 if state.dim > 4 else 2.0
         n = 400_000 if state.dim < 20 else 50_000
-        u = sd * np.random.default_rng(5).standard_normal((n, state.dim))
-        log_weights = -0.5 * np.sum(u * u, axis=1) * (1 - sd**-2) + state.dim * np.log(sd)
-        values = np.exp(log_weights) * (state.f(u) <= 0)
-        error = values.std() / np.sqrt(n)
+        mean, error = estimate_by_draws(state.f, state.dim, sd, n, 5)
         assert error < 0.1 * state.p or state.p <= 1e-6 or state.dim >= 20, name
-        assert values.mean() == pytest.approx(state.p, abs=4 * error + 4 * state.p / np.sqrt(n * state.p + 1)), name
+        assert mean == pytest.approx(state.p, abs=4 * error + 4 * state.p / np.sqrt(n * state.p + 1)), name
 
 
 def test_probabilities_of_fresh_states_against_draws():
-    """By 400,000 weighted draws of N(0, s^2 I), within four standard errors, or plain ones where p is large enough."""
+    """By weighted draws, within four standard errors, or plain ones where p is large enough."""
     for make in HELD_OUT:
         state = make()
-        scale = 1.6 if state.p > 1e-4 else 2.3
-        u = scale * np.random.default_rng(1).standard_normal((400_000, state.dim))
-        log_weights = state.dim * np.log(scale) - 0.5 * (1 - scale**-2) * (u**2).sum(axis=1)
-        terms = np.where(state.problem().evaluate(u) <= 0, np.exp(log_weights), 0.0)
-        error = terms.std() / len(terms) ** 0.5
+        mean, error = estimate_by_draws(state.problem().evaluate, state.dim, 1.6 if state.p > 1e-4 else 2.3, 400_000, 1)
         assert error < 0.05 * state.p, make.__name__
-        assert terms.mean() == pytest.approx(state.p, abs=4 * error), make.__name__
+        assert mean == pytest.approx(state.p, abs=4 * error), make.__name__
     for make in BLIND:
         state, rng = make(), np.random.default_rng(0)
         hits = sum(int((state.f(rng.standard_normal((10_000, state.dim))) <= 0).sum()) for _ in range(4))

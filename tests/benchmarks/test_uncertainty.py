@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.uncertainty.base_coverage import (
-    DIRECTION,
-    WORLDS,
-    Repetition,
-    World,
-    repeat,
-    summarise,
-)
+from benchmarks.uncertainty.base_coverage import DIRECTION, WORLDS, Repetition, World, repeat, summarise
 from benchmarks.uncertainty.recipe_coverage import (
     RECIPE_WORLDS,
     FittedRepetition,
@@ -43,21 +36,6 @@ def test_intervals_cover_in_a_few_repetitions():
     assert row["covered"] + row["below"] <= 1
     assert row["rms_log_error"] < 0.3
     assert row["freedom"] is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("world", WORLDS[:2], ids=str)
-def test_intervals_cover_from_events_to_report(world):
-    found = summarise(world, [repeat(world, seed) for seed in range(200)])
-    assert found["covered"] >= 0.92
-    assert found["below"] <= 0.05
-
-
-@pytest.mark.slow
-def test_a_heavy_tail_is_not_covered_by_many_events():
-    found = [repeat(replace(WORLDS[3], clusters=400, correlation=0.0), seed) for seed in range(8)]
-    assert sum(each.covered for each in found) <= 7
-    assert any(each.below for each in found)
 
 
 @pytest.mark.parametrize("world", RECIPE_WORLDS[2:], ids=lambda world: world.name)

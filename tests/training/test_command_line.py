@@ -1,14 +1,13 @@
 """Command lines of the trainings: options, exit codes, one line for an error."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from training.command_line import RecordingOptions, report_errors, spread_options
+from training.command_line import report_errors, spread_options
 
 
 def test_an_error_of_the_user_is_one_line_and_exit_code_2(capsys):
@@ -19,13 +18,6 @@ def test_an_error_of_the_user_is_one_line_and_exit_code_2(capsys):
         assert capsys.readouterr().err == "fit: no such kind\n"
     with pytest.raises(TypeError), report_errors("fit"):  # the program's own are not hidden
         raise TypeError
-
-
-def test_one_source_of_recordings_is_given():
-    assert RecordingOptions(ngsim=Path("a.csv")).kind_and_path() == ("ngsim", Path("a.csv"))
-    for wrong in (RecordingOptions(), RecordingOptions(data=Path("a"), highd=Path("b"))):
-        with pytest.raises(ValueError, match="one of --data, --ngsim, --highd, --tgsim and --i24, with a path"):
-            wrong.kind_and_path()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,14 +21,7 @@ from gymnasium import spaces
 import rare_envs
 from agents import load_ego
 from agents.remote import protocol
-from agents.remote.client import (
-    LinkError,
-    RemoteEgo,
-    RemoteError,
-    ServerLink,
-    connect,
-    parse_address,
-)
+from agents.remote.client import LinkError, RemoteEgo, RemoteError, ServerLink, connect, parse_address
 from agents.remote.protocol import derive_server_keys
 from agents.remote.server import EgoServer, RequestHandler, is_loopback
 from rare_envs.plugins import EgoGone, NoAnswer
@@ -375,5 +368,3 @@ def test_scenarios_on_which_a_process_hangs_or_dies_are_found(dangerous: Any, x:
 def test_what_cannot_be_loaded_in_a_process_is_said_here() -> None:
     with pytest.raises(ValueError, match=r"process:no_such:make refuses: .*Cannot import 'no_such'"):
         load_ego("process:no_such:make")
-    with pytest.raises(ValueError, match="timeout=SECONDS"):
-        load_ego("process:idm?timeuot=3")

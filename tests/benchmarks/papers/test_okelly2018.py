@@ -37,7 +37,6 @@ from benchmarks.papers.okelly2018.search import (
     PRINTED_SEARCH,
     SEARCHES,
     STUDY_SCALES,
-    THRESHOLDS,
     SearchSettings,
     StudyScale,
     choose_sampler,
@@ -47,14 +46,7 @@ from benchmarks.papers.okelly2018.search import (
     make_base,
     take_step,
 )
-from benchmarks.papers.okelly2018.study import (
-    HighwayStudy,
-    RolloutFolder,
-    join_outcomes,
-    measure_highway,
-    split_jobs,
-)
-from benchmarks.papers.okelly2018.tables import explain_differences, make_tables
+from benchmarks.papers.okelly2018.study import HighwayStudy, RolloutFolder, join_outcomes, measure_highway, split_jobs
 from benchmarks.papers.renew import read_records
 from rare_envs.simulation import drive
 from rare_envs.startup import use_one_thread
@@ -400,70 +392,6 @@ def test_a_full_scale_that_is_not_all_run_says_what_the_rest_takes(monkeypatch: 
     last = write_notes(study, found)[-1]
     assert "At 1,000 rollouts a second" in last and "the rest takes 1.0 hours; the same command goes on" in last
     assert len(write_notes(study, {**found, "rollouts": rollouts, "own": [{"n_sim": 6000}] * 4})) == 2
-
-
-# tables: what committed records have is compared with these
-
-GAMMAS = THRESHOLDS["lidar"]
-NOT_RUN = {"iterations": 2, "of": 20, "weights_move": True, "estimates": [], "comparisons": []}
-ESTIMATE = {"n": 1000, "events": 10, "p": 0.01, "standard_error": 0.003, "interval": None}
-COMPARISON = {
-    "events_ratio": 5.0,
-    "events_interval": (3.0, 8.0),
-    "variance_ratio": 7.2,
-    "all_in": 1.2,
-    "error_ratio": None,
-    "errors_off": -5.0,
-}
-RUN = {
-    **NOT_RUN,
-    "iterations": 20,
-    "search": 20_000,
-    "sampler": {"shift": 5.0},
-    "mean_ratio": 1e-9,
-    "estimates": [ESTIMATE] * 4,
-    "comparisons": [COMPARISON] * 4,
-}
-
-
-def found_of(search: dict[str, Any]) -> dict[str, Any]:
-    return {"naive": [ESTIMATE] * 4, "naive_equal": [], "searches": {PRINTED_SEARCH: search}, "own": ()}
-
-
-def tables_of(search: dict[str, Any]):
-    return [table["values"] for table in make_tables("lidar", GAMMAS, found_of(search))]
-
-
-def of(value: dict[str, Any], *names: str) -> list[Any]:
-    return [value[name] for name in names]
-
-
-def test_what_was_not_run_has_no_number() -> None:
-    for values in tables_of(NOT_RUN):
-        rows = [value for value in values if PRINTED_SEARCH in value["labels"][0]]
-        assert rows
-        assert all(of(value, "ours", "reasons") == [None, ("not run",)] for value in rows)
-    assert "2 of 20 iterations" in rows[0]["labels"][0]
-    assert "weights" not in explain_differences("lidar", found_of(NOT_RUN))
-    name = "starts alone, rho 0.1"
-    found = found_of(RUN) | {"searches": {PRINTED_SEARCH: RUN, name: {**NOT_RUN, "weights_move": False}}}
-    for table in make_tables("lidar", GAMMAS, found):
-        (line,) = (value for value in table["values"] if name in value["labels"][0])
-        assert line["labels"] == (f"cross-entropy, {name}: not run", "all")
-
-
-def test_reasons_of_differences() -> None:
-    few, full = ({**found_of(RUN), "naive": [{**ESTIMATE, "n": n}] * 4} for n in (80_000, 1_300_000))
-    assert "with fewer rollouts than theirs" in explain_differences("lidar", few)["scale"]
-    assert "of as many rollouts as theirs" in explain_differences("lidar", full)["scale"]
-    alone = {**RUN, "weights_move": False}
-    values = tables_of(alone)[1]
-    assert all("missed" in value["reasons"] for value in values[:2])
-    assert of(values[3], "ours", "paper") == [-5.0, pytest.approx(0.79, abs=0.01)]  # (19.8 - 12.4) / 9.4
-    events = {**ESTIMATE, "n": 100_000, "events": 48_605}
-    values = tables_of({**alone, "estimates": [{**events, "ess": ess} for ess in (2764.0, 82.0, None, 973.0)]})[1]
-    gains = [value for value in values if value["quantity"] == "variance, naive / sampler, equal draws"]
-    assert ["few draws" in value["reasons"] for value in gains] == [False, True, False, False]
 
 
 # the committed records

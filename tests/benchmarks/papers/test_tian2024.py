@@ -21,13 +21,7 @@ from benchmarks.papers.tian2024.replications import (
     run_replication,
 )
 from benchmarks.papers.tian2024.study import TianPlan, reproduce_tian2024
-from benchmarks.papers.tian2024.summary import (
-    assess_claims,
-    derive,
-    ends_of,
-    ratio_of_work,
-    summarise_runs,
-)
+from benchmarks.papers.tian2024.summary import assess_claims, derive, ends_of, ratio_of_work, summarise_runs
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 from tests.benchmarks.papers.made_runs import made_run
@@ -90,11 +84,6 @@ def test_the_counter_counts_rows_whatever_asks() -> None:
     assert problem.simulated == 7
     cost = problem.gradient(x[:2], terms.least[:2], terms.ticks[[0, 1], terms.least[:2]]).cost
     assert problem.simulated == 7 + np.ceil(cost)
-
-
-def test_noise_of_the_stack_is_part_of_x() -> None:
-    assert [driving_problem("car-following", system).dim for system in ("IDM", "stack")] == [3, 178]
-    assert [driving_problem("cut-in", system).dim for system in ("IDM", "stack")] == [6, 281]
 
 
 def summary_of(estimates: Any, n: float, truth: float) -> pd.DataFrame:

@@ -231,15 +231,12 @@ def test_scenes_follow_the_record_and_meet_where_they_were_cut():
 def test_what_scenes_need_is_named():
     table = cutting_in()
     columns = {name: getattr(table, name) for name in COLUMNS}
-    with pytest.raises(
-        ValueError, match=r"'r' .* lane boundaries, of which it has none.*y = 1\.8 to 5\.2 m, lane 1 at 1\.8 m"
+    for changes, edges, message in (
+        ({}, None, r"'r' .* boundaries, of which it has none.*y = 1\.8 to 5\.2 m, lane 1 at 1\.8 m"),
+        ({}, {"r": (-7.0, -3.5, 0.0)}, r"nobody between .*, \(-7\.0, -3\.5, 0\.0\).* its vehicles are at y ="),
+        ({"width": np.nan}, None, "Scenes need width"),
     ):
-        scenes_of(tabulate(columns))
-    with pytest.raises(
-        ValueError, match=r"nobody between its lane boundaries, \(-7\.0, -3\.5, 0\.0\).* its vehicles are at y ="
-    ):
-        scenes_of(tabulate(columns, {"r": (-7.0, -3.5, 0.0)}))
-    with pytest.raises(ValueError, match="Scenes need width"):
-        scenes_of(tabulate({name: getattr(table, name) for name in COLUMNS} | {"width": np.nan}))
+        with pytest.raises(ValueError, match=message):
+            scenes_of(tabulate({**columns, **changes}, edges))
     with pytest.raises(ValueError, match=r"scenes of 0\.4 s or more"):
         scenes_of(table, seconds=0.1)
