@@ -32,11 +32,7 @@ EVENTS = {"cut_in": ([38, 15], 17), "hard_brake": ([42], 40), "car_following": (
 def fitted_entries(scenario: str, spread: float = 0.3, shift: float = 0.0, **changes: Any) -> dict[str, Any]:
     """Return the entries of a fitted base; a change to None leaves a key out.
 
-    Args:
-        scenario: Name of the scenario.
-        spread: Standard deviation by which the means of the 30 refits differ, in those of the base.
-        shift: By which the means of the base are moved, likewise.
-        changes: Keys of the file.
+    The means of the 30 refits differ by `spread`, those of the base are moved by `shift`, in standard deviations of it.
     """
     parameters = scenario_named(scenario).parameters
     sd = np.array(SPREADS[scenario])
@@ -57,12 +53,7 @@ def fitted_entries(scenario: str, spread: float = 0.3, shift: float = 0.0, **cha
         "family": "1 component",
         "frequency": {**FREQUENCIES[scenario], "definition": "events of a test", "source": "a test"},
         "checks": [{"name": "TTC < 5 s", "recorded": 2, "expected": 7.5}],
-        "provenance": {
-            "source": source,
-            "bic": 1086.8,
-            "held_out_log_prob": -14.6,
-            "coordinates": "plain",
-        },
+        "provenance": {"source": source, "bic": 1086.8, "held_out_log_prob": -14.6, "coordinates": "plain"},
         **changes,
     }
     return {name: value for name, value in entries.items() if value is not None}

@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["tests.rare_envs.study.forked_command_imports"])
+CONTEXT.set_forkserver_preload(
+    ["pyarrow.parquet", "sklearn.cluster", "torch", "rare_envs.study.cli.app", "rare_envs.study.evaluate"]
+)
 TILE = 50
 """Simulations of a chunk without workers."""
 END_SECONDS = 300.0

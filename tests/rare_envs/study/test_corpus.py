@@ -8,7 +8,6 @@ import shutil
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,10 +39,6 @@ def stored(question: Question, *values: float) -> StoredFailure:
     return make_stored(question, x, -1.0, -9.25, "rear_end")
 
 
-def list_failures_of(run: Path) -> list[StoredFailure]:
-    return list_failures(load_finished(run))
-
-
 CRASH, SAFE = stored(FOLLOWING, 20.0, 5.0 / 3.0, 10.0), stored(FOLLOWING, 20.0, 20.0, 80.0)
 
 
@@ -70,22 +65,22 @@ def run(finished_run: Path, tmp_path: Path) -> Path:
 
 
 def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:
-    chosen, new = add_run(run, tmp_path / "corpus", most=5)
+    folder = tmp_path / "corpus"
+    chosen, new = add_run(run, folder, most=5)
     assert new == 5 == len(chosen)
-    assert [each.key for each in read_corpus(tmp_path / "corpus")] == sorted(each.key for each in chosen)
-    before = {path.name: path.read_bytes() for path in (tmp_path / "corpus").iterdir()}
-    assert add_run(run, tmp_path / "corpus", most=5)[1] == 0
-    assert {path.name: path.read_bytes() for path in (tmp_path / "corpus").iterdir()} == before
-    recorded = list_failures_of(run)
+    assert [each.key for each in read_corpus(folder)] == sorted(each.key for each in chosen)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert add_run(run, folder, most=5)[1] == 0
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    recorded = list_failures(load_finished(run))
     assert chosen[0] == recorded[0] and recorded[0].log_p0 >= recorded[-1].log_p0
-    assert recorded[0].crash == "rear_end" and recorded[0].ego == "idm"
 
 
 def test_a_run_with_a_damaged_parameter_is_refused(run: Path) -> None:
     table = (run / "failures.csv").read_text()
     (run / "failures.csv").write_text(table.replace(table.splitlines()[1].split(",")[0], "nan"))
     with pytest.raises(BadInput, match="no number"):
-        list_failures_of(run)
+        list_failures(load_finished(run))
 
 
 def test_trials_in_their_order(tmp_path: Path) -> None:
@@ -116,12 +111,11 @@ def test_code_of_a_corpus_from_elsewhere_waits_for_trust(here: Path) -> None:
 
 
 def test_what_cannot_be_driven_is_one_line(tmp_path: Path) -> None:
-    outside = stored(FOLLOWING, 20.0, 5.0, -10.0)
     gone = stored(Question(env_id="rare_envs/Gone-v0"), 20.0, 5.0, 10.0)
     other = replace(CRASH, x={**CRASH.x, "gap": [1.0, 2.0]})
     for failure, ego, said in (
         (CRASH, "nowhere.zip", "nowhere"),
-        (outside, "idm", "gap"),
+        (stored(FOLLOWING, 20.0, 5.0, -10.0), "idm", "gap"),
         (gone, "idm", "Gone"),
         (other, "idm", "2 values of gap, its scenario has 1"),
     ):
@@ -134,54 +128,36 @@ def test_junit_counts_its_cases_whatever_an_egos_error_says(tmp_path: Path) -> N
     trials = [Trial(CRASH, "passed", 1.5), Trial(CRASH, "failed", -1.0, "side"), error]
     write_junit(tmp_path / "out.xml", trials, "a & b", 3.0)
     root = ET.parse(tmp_path / "out.xml").getroot()
-    suite = root[0]
-    assert root.tag == "testsuites" and suite.tag == "testsuite" and suite.get("name") == "rare-envs corpus, ego a & b"
+    [suite] = root
+    assert (root.tag, suite.tag, suite.get("name")) == ("testsuites", "testsuite", "rare-envs corpus, ego a & b")
     cases = suite.findall("testcase")
     for counted in (root, suite):
-        assert (counted.get("tests"), counted.get("failures"), counted.get("errors")) == ("3", "1", "1")
+        assert [counted.get(name) for name in ("tests", "failures", "errors")] == ["3", "1", "1"]
     assert [[child.tag for child in case] for case in cases] == [[], ["failure"], ["error"]]
     assert all(case.get("name") == CRASH.key and case.get("classname") == ENV for case in cases)
     assert sum(float(str(case.get("time"))) for case in cases) == 3.0
     assert "no answer" in str(cases[2][0].get("message")) and cases[1][0].get("type") == "side"
 
 
-def make_run(folder: Path, base: str, **more: Any) -> Path:
-    asked = Question(env_id=ENV, base=base, method="mc", max_sim=500, horizon=4.0, core="torch", **more)
-    run_into(folder, prepare(asked))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def ego(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("egos")
-    return str(train_ego(ENV, "a2c", 16, num_envs=8, out=folder / "ego.zip", progress=False))
-
-
 @pytest.mark.slow
-def test_a_retraining_has_the_failures_of_all_runs_and_the_ego_of_the_last(
-    ego: str, risky: str, tmp_path: Path
-) -> None:
-    first = make_run(tmp_path / "first", risky, ego="idm", observation="features")
-    second = make_run(tmp_path / "second", risky, ego=ego, seed=5)
-    plan = plan_retraining([first, second], 0.3)
-    assert (plan.env_id, plan.algo, plan.next_seed, plan.retraining.share) == (ENV, "a2c", 6, 0.3)
-    assert (plan.world["base"], plan.world["horizon"], plan.retraining.ego) == (risky, 4.0, Path(ego))
-    failures = [*list_failures_of(first), *list_failures_of(second)]
-    assert len(failures) > 4
+def test_a_retraining_has_the_failures_of_its_runs_which_go_together(risky: str, safe: str, tmp_path: Path) -> None:
+    own = train_ego(ENV, "a2c", 16, num_envs=8, out=tmp_path / "own.zip", progress=False)
+    first, other, rule = (tmp_path / name for name in ("first", "other", "rule"))
+    for folder, base, ego in ((first, risky, str(own)), (other, safe, "idm"), (rule, risky, "idm")):
+        asked = Question(env_id=ENV, base=base, method="mc", max_sim=500, horizon=4.0, core="torch", ego=ego)
+        run_into(folder, prepare(asked))
+    plan = plan_retraining([rule, first], 0.3)
+    assert (plan.world["horizon"], plan.retraining.share, plan.retraining.ego) == (4.0, 0.3, own)
+    failures = [failure for folder in (rule, first) for failure in list_failures(load_finished(folder))]
     x = [np.concatenate([one.x[name] for name in ("ego_speed", "lead_speed", "gap")]) for one in failures]
-    assert np.array_equal(plan.retraining.failures, x)
-
-
-@pytest.mark.slow
-def test_runs_that_do_not_go_together_are_refused(ego: str, risky: str, safe: str, tmp_path: Path) -> None:
-    own = shutil.copy(ego, tmp_path / "own.zip")
-    first, other = make_run(tmp_path / "first", risky, ego=str(own)), make_run(tmp_path / "other", safe)
-    with pytest.raises(BadInput, match=r"Expected runs of one environment with the same options, got base = .*safe"):
-        plan_retraining([other, first], 0.3)
-    with pytest.raises(BadInput, match="There is no failure in"):
-        plan_retraining([other], 0.3)
-    with pytest.raises(BadInput, match=r"saved \(.zip\) in .*, got 'idm'"):
-        plan_retraining([make_run(tmp_path / "rule", risky)], 0.3)
+    assert np.array_equal(plan.retraining.failures, x) and len(x) > 4
+    for folders, said in (
+        ([other, first], r"Expected runs of one environment with the same options, got base = .*safe"),
+        ([other], "There is no failure in"),
+        ([rule], r"saved \(.zip\) in .*, got 'idm'"),
+    ):
+        with pytest.raises(BadInput, match=said):
+            plan_retraining(folders, 0.3)
     own.unlink()
     with pytest.raises(BadInput, match="No ego at"):
         plan_retraining([first], 0.3)

@@ -285,9 +285,6 @@ def test_where_everybody_may_add_files_ones_own_are_safe(saved: Path, monkeypatc
     assert find_origin_risks(saved) == []
 
 
-ENV = "rare_envs/CarFollowing-v0"
-
-
 def test_a_server_that_keeps_to_the_protocol_passes() -> None:
     pytest.importorskip("zmq", reason="the extra remote is optional")
     from agents.remote.server import EgoServer

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
 from rare_envs.study.export import export_drive, export_scenario, find_trajectories
 from rare_envs.study.replay import Drive, drive_again
-
-SAMPLE = 0.05
-"""Distance of the points on a reference line among which the nearest is looked for [m]."""
 
 
 def read_centres(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -30,14 +28,10 @@ def read_centres(path: Path) -> dict[str, NDArray[np.float64]]:
     found = {}
     for group in root.iter("ManeuverGroup"):
         name = group.find("Actors/EntityRef").attrib["entityRef"]  # type: ignore[union-attr]
-        rows = []
-        for vertex in group.iter("Vertex"):
-            place: Any = vertex.find("Position/WorldPosition")
-            x, y, h = (float(place.attrib[key]) for key in "xyh")
-            rows.append(
-                [float(vertex.attrib["time"]), x + forward[name] * math.cos(h), y + forward[name] * math.sin(h), h]
-            )
-        found[name] = np.array(rows)
+        time = [float(vertex.attrib["time"]) for vertex in group.iter("Vertex")]
+        places = [each.attrib for each in group.iterfind(".//Vertex/Position/WorldPosition")]
+        x, y, h = (np.array([float(place[key]) for place in places]) for key in "xyh")
+        found[name] = np.column_stack((time, x + forward[name] * np.cos(h), y + forward[name] * np.sin(h), h))
     return found
 
 
@@ -84,7 +78,7 @@ class RoadReader:
 
 def _sample_geometry(geometry: Any) -> NDArray[np.float64]:
     s, x, y, heading, length = (float(geometry.attrib[key]) for key in ("s", "x", "y", "hdg", "length"))
-    p = np.linspace(0.0, length, math.ceil(length / SAMPLE) + 1)
+    p = np.linspace(0.0, length, math.ceil(length / 0.05) + 1)  # the nearest is looked for among points 5 cm apart
     cubic = geometry.find("paramPoly3")
     if cubic is None:
         assert geometry.find("line") is not None
@@ -120,34 +114,32 @@ def highway() -> Drive:
     return drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0])
 
 
+@pytest.fixture(params=["cut_in", "highway"])
+def drive(request: pytest.FixtureRequest) -> Drive:
+    found: Drive = request.getfixturevalue(request.param)
+    return found
+
+
 def export(drive: Drive, folder: Path, name: str) -> Path:
     path = folder / f"{name}.xosc"
     export_drive(drive, path, "carla" if name == "carla" else "openscenario")
     return path
 
 
-def schema_folder() -> Path:
-    """The schemas lie beside the library, in the same wheel."""
-    import scenariogeneration
-
-    return Path(str(scenariogeneration.__file__)).parents[1] / "schemas"
-
-
 @pytest.mark.parametrize("name", ["openscenario", "carla"])
-def test_files_are_valid_by_their_schemas(cut_in: Drive, highway: Drive, tmp_path: Path, name: str) -> None:
+def test_files_are_valid_by_their_schemas(drive: Drive, tmp_path: Path, name: str) -> None:
+    import scenariogeneration
     from lxml import etree
 
-    story = etree.XMLSchema(etree.parse(str(schema_folder() / f"OpenSCENARIO_1_{0 if name == 'carla' else 2}.xsd")))
-    road = etree.XMLSchema(etree.parse(str(schema_folder() / "opendrive_17_core.xsd")))
-    for drive in (cut_in, highway):
-        path = export(drive, tmp_path, name)
-        story.assertValid(etree.parse(str(path)))
-        road.assertValid(etree.parse(str(path.with_suffix(".xodr"))))
+    schemas = Path(str(scenariogeneration.__file__)).parents[1] / "schemas"  # in the same wheel
+    story = etree.XMLSchema(etree.parse(str(schemas / f"OpenSCENARIO_1_{0 if name == 'carla' else 2}.xsd")))
+    road = etree.XMLSchema(etree.parse(str(schemas / "opendrive_17_core.xsd")))
+    path = export(drive, tmp_path, name)
+    story.assertValid(etree.parse(str(path)))
+    road.assertValid(etree.parse(str(path.with_suffix(".xodr"))))
 
 
-@pytest.mark.parametrize("which", ["cut_in", "highway"])
-def test_positions_are_read_back_on_the_road(which: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    drive: Drive = request.getfixturevalue(which)
+def test_positions_are_read_back_on_the_road(drive: Drive, tmp_path: Path) -> None:
     path = export(drive, tmp_path, "openscenario")
     read, road = read_centres(path), RoadReader(path.with_suffix(".xodr"))
     names = ["Ego", *drive.problem.world.scenario.vehicle_names[1:]]
@@ -180,12 +172,11 @@ def test_the_reference_point_is_the_rear_axle(cut_in: Drive, tmp_path: Path) -> 
 def test_scenario_runner_finds_its_conventions(cut_in: Drive, tmp_path: Path) -> None:
     """A free ego named hero, spawned at its centre; and everything that scenario_runner insists on."""
     path = export(cut_in, tmp_path, "carla")
-    root = ET.parse(path).getroot()
+    root: Any = ET.parse(path).getroot()
     header = root.find("FileHeader")
-    assert header is not None and (header.get("revMajor"), header.get("revMinor")) == ("1", "0")
+    assert (header.get("revMajor"), header.get("revMinor")) == ("1", "0")
     assert not header.attrib["description"].startswith("CARLA:")  # that would mirror y once more
-    catalogs = root.find("CatalogLocations")
-    assert catalogs is not None and len(catalogs) == 0
+    assert len(root.find("CatalogLocations")) == 0
     assert set(read_centres(path)) == {"cutter", "lead"}
     assert read_start(path)["cutter"][0] == pytest.approx(11.0)
     types = {
@@ -193,19 +184,10 @@ def test_scenario_runner_finds_its_conventions(cut_in: Drive, tmp_path: Path) ->
         for entity in root.iter("ScenarioObject")
     }
     assert types == {"hero": "ego_vehicle", "cutter": "simulation", "lead": "simulation"}
-    modules = {
-        private.get("entityRef"): [
-            each.get("value") for each in private.iter("Property") if each.get("name") == "module"
-        ]
-        for private in root.iter("Private")
-    }
-    assert modules == {
-        "hero": ["external_control"],
-        "cutter": ["simple_vehicle_control"],
-        "lead": ["simple_vehicle_control"],
-    }
-    stop = root.find("Storyboard/StopTrigger")
-    assert stop is not None and "criteria_CollisionTest" in {each.get("name") for each in stop.iter("Condition")}
+    for private in root.iter("Private"):
+        module = "external_control" if private.get("entityRef") == "hero" else "simple_vehicle_control"
+        assert [each.get("value") for each in private.iterfind(".//Property[@name='module']")] == [module]
+    assert root.find("Storyboard/StopTrigger//Condition[@name='criteria_CollisionTest']") is not None
 
 
 def test_a_free_ego_has_no_trajectory(tmp_path: Path) -> None:
@@ -217,33 +199,18 @@ def test_a_free_ego_has_no_trajectory(tmp_path: Path) -> None:
     assert named["cut_in_gap"] == "6.0" and named["env_id"] == "rare_envs/CutIn-v0" and named["f"] == "-1.0"
 
 
-X = [20.0, 5.0, 10.0]
-
-
-@pytest.fixture(scope="module")
-def problem() -> DrivingProblem:
-    return DrivingProblem("rare_envs/CarFollowing-v0")
-
-
-def test_a_missing_library_is_named(problem: DrivingProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_named(cut_in: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("scenariogeneration")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "scenariogeneration", None)
     with pytest.raises(ValueError, match=r"rare-envs\[export\]"):
-        export_scenario(problem, X, tmp_path / "a.xosc")
-    assert len(export_scenario(problem, X, tmp_path / "a.xml", "commonroad")) == 1
+        export_drive(cut_in, tmp_path / "a.xosc")
+    assert len(export_drive(cut_in, tmp_path / "a.xml", "commonroad")) == 1
 
 
-def test_a_crash_at_the_start_stands_for_one_tick(problem: DrivingProblem, tmp_path: Path) -> None:
-    drive = drive_again(problem, np.array(X))
-    found = find_trajectories(Drive(problem, drive.episodes[:1]))
+def test_a_crash_at_the_start_stands_for_one_tick(cut_in: Drive) -> None:
+    found = find_trajectories(Drive(cut_in.problem, cut_in.episodes[:1]))
     assert found.time.tolist() == [0.0, 0.1] and np.array_equal(found.x[0], found.x[1])
-
-
-@pytest.fixture(scope="module", params=["CutIn", "Highway"])
-def drive(request: pytest.FixtureRequest) -> Drive:
-    problem = DrivingProblem(f"rare_envs/{request.param}-v0", horizon=3.0)
-    return drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0])
 
 
 def world_of(drive: Drive) -> tuple[np.ndarray[Any, Any], ...]:
@@ -252,8 +219,6 @@ def world_of(drive: Drive) -> tuple[np.ndarray[Any, Any], ...]:
     x, y, heading = drive.position[..., 0], drive.position[..., 1], drive.heading
     if line is None:
         return x, -y, -heading
-    import torch
-
     point = line.at(torch.from_numpy(x.copy()))
     px, py, ph = (part.numpy() for part in point[:3])
     return px - y * np.sin(ph), -(py + y * np.cos(ph)), -(ph + heading)

@@ -12,14 +12,12 @@ import pytest
 from scipy import stats
 
 import rare_envs
-from rare_envs.exposure import TotalRate
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.report import describe_left_out, find_frequency
 from rare_envs.study.risk import choose_base, compare_sites
-from rare_envs.study.text import describe_uncertainty, format_rate, format_with_interval
-from tests.rare_envs.exposure.test_rate import frequency, rate
+from rare_envs.study.text import format_rate, format_with_interval
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
 
 FEW = {"method": "mc", "max_sim": 400}
@@ -57,18 +55,15 @@ def test_nothing_failed(tmp_path: Path) -> None:
     assert left_out.startswith("nothing failed")
 
 
-NO_COLLISIONS = {
-    "--measure drac": {"measure": "drac"},
-    "--gamma 1": {"gamma": 1.0},
-    "--gamma -0.5": {"measure": "margin", "gamma": -0.5},
-    "--gamma -2": {"measure": "clearance", "gamma": -2.0},
-    "--collisions any": {"collisions": "any"},
-}
-
-
 def test_what_counts_no_collisions_has_no_rate(bases: dict[str, str]) -> None:
     study = prepare(question(bases["hard_brake"]))
-    for said, changes in NO_COLLISIONS.items():
+    for said, changes in (
+        ("--measure drac", {"measure": "drac"}),
+        ("--gamma 1", {"gamma": 1.0}),
+        ("--gamma -0.5", {"measure": "margin", "gamma": -0.5}),
+        ("--gamma -2", {"measure": "clearance", "gamma": -2.0}),
+        ("--collisions any", {"collisions": "any"}),
+    ):
         with pytest.raises(ValueError, match=said):
             find_frequency(replace(study, question=replace(study.question, **changes)))
 
@@ -176,11 +171,3 @@ def test_a_rate_has_two_digits_and_with_its_interval_one_form() -> None:
         (2e-7, (0.0, 1700.0), "2.0e-07 (below 1.7e+03)"),
     ):
         assert format_with_interval(value, interval) == text
-
-
-def test_the_line_of_a_total_names_the_largest_source_first() -> None:
-    total = TotalRate((rate(spread=1.4, counted=frequency(100)),))
-    text = describe_uncertainty(total, {"cut_in": 38})
-    assert text.startswith("the uncertainty is 99 % the cut-in distribution, 0.5 % event counts, 0.02 % simulation;")
-    assert "120 further recorded cut-ins would halve it (a spread falls with 1 / sqrt(events))" in text
-    assert "further" not in describe_uncertainty(total, {})

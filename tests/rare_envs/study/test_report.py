@@ -79,15 +79,6 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     assert not (here / "run" / "faults.csv").exists()
 
 
-@pytest.mark.slow
-def test_a_doubt_about_the_base_distribution_makes_a_report_doubtful() -> None:
-    """Some 20 failures tell p to a quarter, and are too few to tell it under each of 30 refits."""
-    report = run(prepare(Question(env_id="rare_envs/CutIn-v0", method="mc", max_sim=20_000, seed=1)))
-    assert not report.estimate.warnings
-    assert any("refits rest on under 10 effective failing points" in text for text in report.warnings)
-    assert report.doubtful and report.to_dict()["doubtful"]
-
-
 def test_plain_monte_carlo_is_advised_where_it_would_find_enough(
     risky: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,12 +88,6 @@ def test_plain_monte_carlo_is_advised_where_it_would_find_enough(
         print_report(replace(report, estimate=replace(report.estimate, p=p, cov=0.1)))
         line = capsys.readouterr().out.partition("check: --method mc ")[2]
         assert line.startswith(said) and bool(line) == bool(said), (p, line)
-
-
-def test_progress_reaches_the_caller(risky: str) -> None:
-    seen: list[int] = []
-    report = run(prepare(Question(env_id=FOLLOWING, base=risky)), lambda progress: seen.append(progress.n_sim))
-    assert seen == sorted(seen) and seen[-1] == report.estimate.n_sim
 
 
 def test_the_ratio_of_an_ego_that_brakes_and_one_that_does_not(cli, risky, here):

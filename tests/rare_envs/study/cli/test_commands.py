@@ -14,9 +14,8 @@ import gymnasium as gym
 import highway_env  # noqa: F401  (registers its ids)
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import agents
 import rare_envs
@@ -61,29 +60,25 @@ def test_all_names_fit_a_screen(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("COLUMNS", "80")
     entries, shown = json.loads(cli("list", "--json").stdout), cli("list").stdout
     assert len(shown.splitlines()) <= 24
-    words = set(shown.replace(",", " ").split())
     names = [*entries["environments"], *entries["highway_env"], *(name for kind in TITLES for name in entries[kind])]
     names += [each["name"] for environment in entries["environments"].values() for each in environment["parameters"]]
-    assert {word for name in names for word in name.replace(",", " ").split()} <= words
-    (highway,) = (line for line in shown.splitlines() if "Highway-v0" in line)
-    assert "weights, noise" in highway
-    assert all("weights" not in line for line in shown.splitlines() if "CutIn" in line)
+    assert set(" ".join(names).replace(",", " ").split()) <= set(shown.replace(",", " ").split())
+    weighted = [line for line in shown.splitlines() if "weights" in line]
+    assert any("Highway-v0" in line for line in weighted) and not any("CutIn" in line for line in weighted)
 
 
 def test_one_kind_is_explained_alone(cli: Cli) -> None:
     whole = json.loads(cli("list", "all", "--json").stdout)
-    for what, there, absent, keys in (
-        ("egos", "rule-based driver", "lateral_offset", ["egos"]),
-        ("measures", "Post-encroachment time", "rule-based driver", ["measures"]),
-        ("CutIn-v0", "us101-closing", "CarFollowing", None),
-        ("rare_envs/CutIn-v0", "lateral_offset", "CarFollowing", None),
-        ("environments", "merge-v0", "rule-based driver", ["environments", "highway_env"]),
+    cut_in = {"environments": {"rare_envs/CutIn-v0": whole["environments"]["rare_envs/CutIn-v0"]}}
+    for what, there, absent, expected in (
+        ("egos", "rule-based driver", "lateral_offset", {"egos": whole["egos"]}),
+        ("CutIn-v0", "us101-closing", "CarFollowing", cut_in),
+        ("rare_envs/CutIn-v0", "lateral_offset", "CarFollowing", cut_in),
     ):
-        shown, alone = cli("list", what).stdout, json.loads(cli("list", what, "--json").stdout)
+        shown = cli("list", what).stdout
         assert there in shown and absent not in shown
-        env_id = "rare_envs/CutIn-v0"
-        one = {"environments": {env_id: whole["environments"][env_id]}}
-        assert alone == (one if keys is None else {key: whole[key] for key in keys})
+        assert json.loads(cli("list", what, "--json").stdout) == expected
+    assert list(json.loads(cli("list", "environments", "--json").stdout)) == ["environments", "highway_env"]
 
 
 def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,9 +87,6 @@ def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.
         "plain": {**json.loads(HARD_BRAKE.bases["us101-all-brakings"].read_text()), "provenance": None},
     }
     monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
-    answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
-    assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
-    assert answer["env_id"] == "rare_envs/HardBrake-v0"
     text = " ".join(cli("bases", "rare_envs/HardBrake-v0").stdout.split())
     assert "us101 (the default) fitted to 42 events of 40 scenes, 30 refits" in text
     assert "site site of hard_brake, 2005-06-15" in text
@@ -155,10 +147,8 @@ def test_an_ego_is_checked_in_the_traffic_that_is_asked_for(cli: Cli) -> None:
 
 
 def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
     model, out = tmp_path / "ego.zip", tmp_path / "a.onnx"
-    PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu", policy_kwargs={"net_arch": [4]}).save(model)
-    env.save(str(tmp_path / "vecnormalize.pkl"))
+    PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, seed=0, policy_kwargs={"net_arch": [4]}).save(model)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "onnx", None)
         said = "Exporting needs onnx and onnxruntime: pip install 'rare-envs[onnx]'."
@@ -166,11 +156,8 @@ def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.Monkey
     assert not out.exists()
     pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
     pytest.importorskip("onnx", reason="the extra onnx is optional")
-    done = cli("export-ego", model, out, "--json")
-    assert done.exit_code == 0, done.output
-    report = json.loads(done.stdout)
-    assert report["onnx"] == str(out)
-    assert report["largest_difference"] <= report["tolerance"]
+    report = json.loads(cli("export-ego", model, out, "--json").stdout)
+    assert report["onnx"] == str(out) and report["largest_difference"] <= report["tolerance"]
     assert cli("export-ego", model, out).stdout == (
         f"Wrote {out}: its actions differ by {report['largest_difference']:.1e} at most on 1,440 random observations.\n"
     )
@@ -188,14 +175,10 @@ def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> Non
     assert result.exit_code == 0, result.stderr
     answer = json.loads(result.stdout)
     assert answer["f"] == answer["f_recorded"] == read_failures(run)["f"][1] == -1.0
-    assert answer["crash"]["kind"] == "rear_end"
-    assert answer["crash"]["vehicles"] == [0, 1]
+    assert (answer["crash"]["kind"], answer["crash"]["vehicles"]) == ("rear_end", [0, 1])
     with Image.open("clip.gif") as film:
         assert film.size == (800, 160 + 48 + CURVES_HEIGHT)
-        length = 0
-        for k in range(film.n_frames):
-            film.seek(k)
-            length += film.info["duration"]
+        length = sum(frame.info["duration"] for frame in ImageSequence.Iterator(film))
     assert length == pytest.approx(1000 * answer["seconds"] + 100 * LAST_FRAME_TICKS, abs=1)  # equal frames are one
     words = cli("replay", run, "--out", "worst.png").stdout
     n_found = json.loads((run / "result.json").read_text())["n_failures"]
@@ -211,22 +194,17 @@ def test_all_failures_replay_and_another_ego_takes_them(cli: Cli, run: Path) -> 
     one = cli("replay", run, "--ego", "egos_here:coasting")
     assert one.exit_code == 0
     assert one.stdout.splitlines()[-1] == "The ego was egos_here:coasting; that of the run had f = -1."
-    table = (run / "failures.csv").read_text().splitlines()
-    row = table[1].split(",")
-    row[table[0].split(",").index("f")] = "-0.5"
-    (run / "failures.csv").write_text("\n".join([table[0], ",".join(row), *table[2:]]) + "\n")
+    table = (run / "failures.csv").read_text()
+    (run / "failures.csv").write_text(table.replace(",-1.0,", ",-0.5,", 1))  # f of the first
     changed = cli("replay", run, "--all")
     assert changed.exit_code == 3 and changed.stdout.count("\n") == 2
 
 
 def test_from_a_run_to_a_regression_test(cli: Cli, run: Path) -> None:
     assert cli("corpus", "add", run).stdout.startswith("Added 20 of 20")
-    again = json.loads(cli("corpus", "add", run, "--json").stdout)
-    assert again["added"] == 0 and len(again["failures"]) == 20
     same = cli("corpus", "run", "--ego", "idm", "--junit", "out.xml", "--json")
-    assert same.exit_code == FAILS
     answer = json.loads(same.stdout)
-    assert (answer["passed"], answer["failed"], answer["error"]) == (0, 20, 0)
+    assert (same.exit_code, answer["passed"], answer["failed"], answer["error"]) == (FAILS, 0, 20, 0)
     assert ET.parse("out.xml").getroot()[0].get("failures") == "20"
     lines = cli("corpus", "run", "--ego", "egos_here:coasting").stdout.splitlines()
     assert lines[0].startswith("egos_here:coasting fails in 20 of 20 scenarios") and len(lines) == 21
@@ -251,18 +229,12 @@ FEW = ("--method", "mc", "--max-sim", 300)
 BRAKE = ("estimate", "rare_envs/HardBrake-v0", *FEW)
 
 
-@pytest.fixture
-def bases(here: Path) -> list[str]:
-    """Options that name a fitted base for each scenario."""
+def test_the_table_and_the_folder(cli: Cli, here: Path) -> None:
     names = ("cut_in", "hard_brake")
-    return [word for name in names for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")]
-
-
-def test_the_table_and_the_folder(cli: Cli, bases: list[str], here: Path) -> None:
+    bases = [word for name in names for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")]
     result = cli("risk", "idm", *bases, *FEW, "--out", here / "out")
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("collisions per million km  ")
-    assert "cut-in        0.26 per km x " in result.stdout
     assert result.stdout.endswith(f"Wrote {here / 'out'}.\n")
     assert (here / "out" / "risk.png").exists()
 
@@ -282,27 +254,19 @@ def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) ->
     base = write_fitted(here / "fitted.json", "hard_brake")
     for words, said in (
         (("--base", base, "--gamma", "1"), "--gamma 1 counts other events"),
-        (("--base", base, "--measure", "drac"), "--measure drac counts other events"),
         (("--base", write_fitted(here / "b.json", "hard_brake", frequency=None)), "nobody counted"),
     ):
-        lines = [line for line in cli(*BRAKE, *words).stdout.splitlines() if "no rate" in line]
-        assert len(lines) == 1
-        assert said in lines[0]
+        [line] = [line for line in cli(*BRAKE, *words).stdout.splitlines() if "no rate" in line]
+        assert said in line
 
 
 def test_p_under_other_bases(cli: Cli, here: Path) -> None:
     """A near one is answered, a far one refused with its reason; one that is not there before any simulation."""
-    base, near, far = (
-        write_fitted(here / f"{name}.json", "hard_brake", shift=shift)
-        for name, shift in (("own", 0.0), ("near", 0.2), ("far", 8.0))
-    )
+    base, near, far = (write_fitted(here / f"{k}.json", "hard_brake", shift=k) for k in (0.0, 0.2, 8.0))
     words = (*BRAKE, "--base", base, "--also-under", f"{near}, {far}")
-    answers = {Path(each["base"]).stem: each for each in json.loads(cli(*words, "--json").stdout)["other_bases"]}
-    assert answers["near"]["refused"] == ""
-    low, high = answers["near"]["interval"]
-    assert low < answers["near"]["p"] < high
-    assert "effective" in answers["far"]["refused"] or "worth" in answers["far"]["refused"]
-    text = cli(*words).stdout
-    assert f"under {near} " in text
-    assert f"under {far} not known: " in " ".join(text.split())
+    one, other = json.loads(cli(*words, "--json").stdout)["other_bases"]
+    assert one["refused"] == "" and one["interval"][0] < one["p"] < one["interval"][1]
+    assert "effective" in other["refused"] or "worth" in other["refused"]
+    text = " ".join(cli(*words).stdout.split())
+    assert f"under {near} " in text and f"under {far} not known: " in text
     assert_refused(cli(*BRAKE, "--base", base, "--also-under", "nowhere"), "nowhere")
