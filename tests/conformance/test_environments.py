@@ -96,20 +96,6 @@ def test_batches_behind_every_vector_wrapper(env_id, observation, action):
         assert ended >= 3, name
 
 
-@pytest.mark.parametrize("wrap", [wrappers.vector.FlattenObservation, wrappers.vector.NormalizeObservation])
-def test_gymnasium_changes_observations_of_batches_that_reset_in_the_next_step_only(wrap):
-    """Ours reset in the same step by default: that is Gymnasium's rule, and its message says so."""
-    silent = tuple(map(int, gym.__version__.split(".")[:2])) < (1, 4)  # these assert, without words
-    error, words = (AssertionError, "^$") if silent else (ValueError, "NEXT_STEP or DISABLED")
-    with pytest.raises(error, match=words):
-        wrap(gym.make_vec(rare_envs.ENV_IDS[0], num_envs=2))
-    batch = wrap(gym.make_vec(rare_envs.ENV_IDS[0], num_envs=2, autoreset_mode="NextStep", horizon=0.5))
-    batch.reset(seed=0)
-    for _ in range(12):  # two episodes each
-        seen, *_ = batch.step(batch.action_space.sample())
-        assert seen in batch.observation_space
-
-
 class Recorded:
     """An ego with a fixed sequence of actions, whatever it sees."""
 

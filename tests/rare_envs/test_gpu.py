@@ -22,10 +22,7 @@ from training.data import scenes_of, synthetic_traffic
 from training.imitation.config import Config
 from training.imitation.train import make_learner, prepare_data, train_learner
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 CAR_FOLLOWING, CUT_IN, HIGHWAY = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0", "rare_envs/Highway-v0"
 ROUNDING = 1e-3
 """Greatest difference of f [s]: sums and tangents round differently, and a short time to collision is a ratio."""
@@ -37,14 +34,9 @@ def of_both(env_id: str, rows: int, **settings: Any) -> tuple[Any, Any, NDArray[
     on_gpu = rare_envs.DrivingProblem(env_id, device="cuda", **settings)
     x = on_cpu.base.sample(rows, np.random.default_rng(3))
     if env_id != HIGHWAY:  # the whole box instead of ordinary traffic
-        low, high = _box(on_cpu)
+        low, high = np.array([(each.low, each.high) for each in on_cpu.world.scenario.parameters]).T
         x[:, : len(low)] = np.random.default_rng(4).uniform(low, high, (rows, len(low)))
     return on_cpu, on_gpu, x
-
-
-def _box(problem: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    own = problem.world.scenario.parameters
-    return np.array([each.low for each in own]), np.array([each.high for each in own])
 
 
 def assert_same(one: NDArray[np.float64], other: NDArray[np.float64]) -> None:

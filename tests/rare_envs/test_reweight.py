@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 import rare_envs
 import samplers
@@ -42,16 +41,6 @@ def fitted_us101(number=30):
     )
 
 
-@pytest.mark.slow
-def test_p_under_refits_against_simulating_them():
-    base = fitted_us101(4)
-    found = samplers.estimate(problem(base), seed=1, max_sim=3000).base_uncertainty
-    assert found.fitted_to == "470 events of 28 scenes"
-    for refit, p, ess in zip(base.refits, found.value_refits, found.ess_refits, strict=True):
-        direct = samplers.estimate(problem(refit), seed=2, max_sim=3000)
-        assert abs(np.log(p / direct.p)) < 4 * np.hypot(direct.cov, ess**-0.5)
-
-
 def test_a_safer_ego_is_safer_under_every_refit_and_the_ratio_is_known_better_than_p():
     base = fitted_us101()
     careful, usual = (
@@ -60,9 +49,5 @@ def test_a_safer_ego_is_safer_under_every_refit_and_the_ratio_is_known_better_th
     )
     found = samplers.compare(usual, careful, seed=1, max_sim=8000)
     assert min(found.base_uncertainty.value_refits) > 1
-    widths = [np.log(each[1] / each[0]) for each in (found.base_uncertainty.interval, _p_interval(found))]
-    assert widths[0] < widths[1]
-
-
-def _p_interval(found):
-    return found.either.base_uncertainty.interval
+    of_ratio, of_p = (np.ptp(np.log(each.base_uncertainty.interval)) for each in (found, found.either))
+    assert of_ratio < of_p

@@ -141,12 +141,13 @@ def test_reset_options_reach_our_environments() -> None:
 # --- several agents ---------------------------------------------------------------------------
 
 
-def test_rows_are_the_agents_of_the_parallel_environment():
+@pytest.mark.parametrize("settings", [{}, {"observation": "camera", "camera": (36, 60)}])
+def test_rows_are_the_agents_of_the_parallel_environment(settings):
     """The same scenarios and actions give the same observations, rewards and ends, row by row, to the last bit."""
-    batch = AgentsVectorEnv(CUT_IN, 3, horizon=2.0, drivers="idm")
+    batch = AgentsVectorEnv(CUT_IN, 3, horizon=2.0, drivers="idm", **settings)
     batch.action_space.seed(0)
     batch.reset(seed=0)
-    several = [rare_envs.parallel_env(CUT_IN, horizon=2.0, drivers="idm") for _ in range(3)]
+    several = [rare_envs.parallel_env(CUT_IN, horizon=2.0, drivers="idm", **settings) for _ in range(3)]
     names, n = several[0].possible_agents, len(several[0].possible_agents)
     for env, row in zip(several, batch._x.copy(), strict=True):
         env.reset(options={"x": row})

@@ -78,19 +78,6 @@ def test_two_who_move_to_one_place_do_not_meet():
     assert all(apart)
 
 
-def test_on_the_highway_nothing_of_them_is_part_of_x_and_no_lidar_is_computed():
-    world, space = set_up("rare_envs/Highway-v0", drivers="idm+mobil", horizon=6.0)
-    assert space.dim == 24
-    assert not world.uses_lidar
-    x = torch.from_numpy(space.sample(32, np.random.default_rng(0)))
-    episode = world.start(x)
-    for _ in range(60):
-        episode = world.step(episode, torch.zeros(32, 2, dtype=x.dtype))
-    road = episode.road
-    assert (episode.state.y[:, 1:] - road.centre_of(episode.state.y[:, 1:])).abs().max() < 2.0
-    assert not road.off_road(episode.state.y).any()
-
-
 def test_behind_a_slow_ego_they_change_lanes_on_the_curve():
     world, _ = set_up("rare_envs/Highway-v0", drivers="idm+mobil", horizon=20.0)
     start = torch.tensor([[120.0, 80.0, 60.0, 100.0, 90.0, 70.0] + [0.0] * 12 + [10.0] + [20.0] * 5])

@@ -78,9 +78,6 @@ def draw(mixture: TruncatedGaussianMixture, n: int, seed: int) -> NDArray[np.flo
     return mixture.sample(n, np.random.default_rng(seed))
 
 
-# --- density ----------------------------------------------------------------------------------------
-
-
 def marginal(mixture: TruncatedGaussianMixture, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Density of the untruncated mixture's first x.shape[1] coordinates, by SciPy."""
     k = x.shape[1]
@@ -148,9 +145,6 @@ def test_density_is_that_of_normals_through_the_map(mixture: TruncatedGaussianMi
     u = mixture.to_standard_normal(x)
     expected = stats.norm.logpdf(u).sum(axis=1) + np.linalg.slogdet(np.stack(change, axis=2) / 2e-5)[1]
     np.testing.assert_allclose(mixture.log_prob(x), expected, atol=1e-5)
-
-
-# --- samples and maps ---------------------------------------------------------------------------------
 
 
 def check_normal(u: NDArray[np.float64]) -> None:
@@ -263,9 +257,6 @@ def test_draws_are_seeded_and_neither_their_number_nor_chunks_show() -> None:
         x = draw(CUT_IN, n, 0)
         assert (x.shape, CUT_IN.log_prob(x).shape) == ((n, 6), (n,))
         assert CUT_IN.from_standard_normal(CUT_IN.to_standard_normal(x)).shape == (n, 6)
-
-
-# --- files and bad input --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mixture", [CUT_3D, FOLLOWING], ids=["plain", "closing"])

@@ -90,9 +90,6 @@ def mixture_cdf(x: FloatArray, weights: list[float], means: list[float], scales:
     return (to_x - below) / (whole - below)
 
 
-# --- masses -------------------------------------------------------------------------------------
-
-
 def test_mass_of_a_far_tail_is_its_asymptotic_series() -> None:
     """1 - Phi(a) = phi(a) / a (1 - 1 / a^2 + 3 / a^4 - 15 / a^6 + ...); for a = 100 the next term is 1e-14."""
     a, far = np.array([100.0]), np.array([np.inf])
@@ -100,9 +97,6 @@ def test_mass_of_a_far_tail_is_its_asymptotic_series() -> None:
     expected = stats.norm.logpdf(a) - np.log(a) + np.log(series)
     np.testing.assert_allclose(log_interval(a, far, far), expected, rtol=1e-13)
     np.testing.assert_allclose(log_interval(-far, -a, far), expected, rtol=1e-13)
-
-
-# --- maps to and from the standard normal -------------------------------------------------------
 
 
 def test_two_modes_far_apart_are_two_normals_with_half_of_the_probability_each() -> None:

@@ -82,15 +82,6 @@ def test_the_numbers_in_the_picture_by_hand():
     assert caption(world, episode, None).endswith("f so far 14.50")
 
 
-def test_a_window(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = gym.make(CUT_IN, render_mode="human", horizon=1.0)
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
-    assert env.render() is None
-    env.close()
-
-
 @pytest.mark.parametrize("mode", [None, "rgb_array", "human"])
 def test_nothing_to_render_is_a_warning(mode, monkeypatch):
     world, warned = set_up("rare_envs/CarFollowing-v0")[0], []

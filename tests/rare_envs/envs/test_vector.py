@@ -149,15 +149,3 @@ def test_a_generator_that_others_draw_from_too_is_not_put_back(kind: type[np.ran
     others = rng.random(5)
     ahead.settle()
     assert not np.isin(rng.random(10 * ROWS_AHEAD), others).any()
-
-
-@scripted
-def test_reset_options(env_id: str) -> None:
-    env = gym.make(env_id)
-    name = env.unwrapped.space.names[0]  # type: ignore[attr-defined]
-    _, free = env.reset(seed=11)
-    _, given = env.reset(seed=11, options={name: 12.5})
-    assert given["scenario"][name] == 12.5
-    assert np.array_equal(given["x"][1:], free["x"][1:])  # the others are drawn as without the option
-    _, again = env.reset(options={"x": free["x"]})
-    np.testing.assert_array_equal(again["x"], free["x"])

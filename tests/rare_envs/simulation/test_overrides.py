@@ -25,22 +25,6 @@ def ego_action(n):
 
 @every
 @torch.inference_mode()
-def test_nobody_commanded_is_as_without_commands(env_id):
-    world, episode = start(env_id, horizon=2.0)
-    alone = episode
-    batch, n = episode.state.x.shape
-    action = torch.full((batch, n, 2), 3.0)
-    action[:, 0] = ego_action(batch)
-    for _ in range(world.clock.ticks):
-        alone = world.step(alone, ego_action(batch))
-        episode = world.step(episode, action, torch.zeros(batch, n, dtype=torch.bool))
-        for one, other in zip(alone.state, episode.state, strict=True):
-            assert torch.equal(one, other)
-        assert torch.equal(alone.f, episode.f)
-
-
-@every
-@torch.inference_mode()
 def test_a_commanded_vehicle_moves_as_an_ego_in_its_place_would(env_id):
     world, episode = start(env_id, horizon=2.0, drivers="idm")
     batch, n = episode.state.x.shape

@@ -1,6 +1,5 @@
 """Terms of rollouts: their least is f to the bit, in every scenario, for every measure that is a least over moments."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -40,13 +39,14 @@ def make(case: str, **more: Any) -> tuple[rare_envs.DrivingProblem, np.ndarray]:
     return problem, problem.base.from_standard_normal(u)
 
 
-def cases() -> Iterator[Any]:
-    for case in CASES:
-        measures = ("clearance", "lidar_ttc") if case.startswith("highway") else MEASURES
-        yield from (pytest.param(case, measure, id=f"{case}-{measure}") for measure in measures)
-
-
-@pytest.mark.parametrize(("case", "measure"), list(cases()))
+@pytest.mark.parametrize(
+    ("case", "measure"),
+    [
+        (case, measure)
+        for case in CASES
+        for measure in (("clearance", "lidar_ttc") if case.startswith("highway") else MEASURES)
+    ],
+)
 def test_the_least_term_is_f_and_decides_the_failure(case: str, measure: str) -> None:
     problem, x = make(case, measure=measure, horizon=SHORT)
     x = x[:8] if measure == "pet" else x  # slow
