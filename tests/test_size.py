@@ -11,19 +11,19 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 58_100,
-    "code lines": 35_800,
-    "modules": 218,
-    "functions": 3_330,
-    "classes": 543,
-    "import lines, percent of code": 11.0,
-    "test lines": 33_700,
+    "package lines": 51_600,
+    "code lines": 32_700,
+    "modules": 208,
+    "functions": 2_890,
+    "classes": 447,
+    "import lines, percent of code": 10.8,
+    "test lines": 29_800,
     "pages": 18,
     "words of pages": 40_000,
-    "files entered by an estimate": 42,
-    "files entered by plain Monte Carlo": 24,
-    "files entered by the command": 84,
-    "own frames from estimate to f": 6,
+    "files entered by an estimate": 40,
+    "files entered by plain Monte Carlo": 20,
+    "files entered by the command": 78,
+    "own frames from estimate to f": 8,
     "own frames from the command to f": 16,
 }
 """What must not grow; the aims are `benchmarks.size.BUDGETS`."""
