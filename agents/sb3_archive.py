@@ -162,6 +162,8 @@ def build_policy(algorithm: str, header: Mapping[str, Any], weights: bytes, trus
     missing = [name for name in left.missing_keys if not name.startswith(("pi_features_", "vf_features_"))]
     if missing or left.unexpected_keys:
         raise ValueError(f"its weights lack {missing[:3]} and have {left.unexpected_keys[:3]} beside")
+    if header.get("use_sde") is True:  # its exploration is by the loaded deviations, as `load` of SB3 draws it
+        policy.reset_noise()
     return policy, dict(given)
 
 

@@ -334,7 +334,7 @@ FALSE_ALARM = 1e-6
 ROUND_TRIP = 1e-3
 """Largest error of x -> u -> x, as a share of the standard deviation of a coordinate: numerical inverses, float32."""
 MAX_CORRELATED = 1000
-"""Coordinates up to which every pair is looked at; of more, the first ones."""
+"""Coordinates up to which every pair is looked at; of more, the pairs within blocks of so many."""
 
 
 def find_base_fault(base: Any, dim: int, n: int = N_DRAWS) -> str | None:
@@ -377,20 +377,23 @@ def _find_other_law(u: FloatArray) -> str | None:
     n, dim = u.shape
     level = FALSE_ALARM / 4 / dim
     room = -float(ndtri(level / 2)) / n**0.5
-    low, high = (2 * float(gammaincinv(n / 2, level / 2)) / n) ** 0.5, (float(chdtri(n, level)) / n) ** 0.5
+    low, high = (2 * float(gammaincinv(n / 2, level / 2)) / n) ** 0.5, (float(chdtri(n, level / 2)) / n) ** 0.5
     reached, steps = ndtr(np.sort(u, axis=0)), np.arange(n + 1)[:, None] / n
     distance = np.maximum(steps[1:] - reached, reached - steps[:-1]).max(axis=0)
-    centred = (u - u.mean(axis=0))[:, :MAX_CORRELATED]
+    centred = u - u.mean(axis=0)
     centred /= np.sqrt((centred**2).sum(axis=0))
-    pairs = np.triu_indices(centred.shape[1], 1)
-    t = -float(stdtrit(n - 2, FALSE_ALARM / 8 / max(len(pairs[0]), 1)))
+    blocks = np.split(np.arange(dim), range(MAX_CORRELATED, dim, MAX_CORRELATED))
+    pairs = np.hstack([block[np.stack(np.triu_indices(len(block), 1))] for block in blocks])
+    products = [centred[:, block].T @ centred[:, block] for block in blocks]
+    correlations = np.concatenate([each[np.triu_indices(len(each), 1)] for each in products])
+    t = -float(stdtrit(n - 2, FALSE_ALARM / 8 / max(pairs.shape[1], 1)))
     together = t / (n - 2 + t**2) ** 0.5
     columns = ("in coordinate", np.arange(dim)[None])
     for what, values, least, most, (at, places) in (
         ("mean", u.mean(axis=0), -room, room, columns),
         ("standard deviation", (u**2).mean(axis=0) ** 0.5, low, high, columns),
         ("Kolmogorov distance", distance, 0.0, (math.log(2 / level) / (2 * n)) ** 0.5, columns),
-        ("correlation", (centred.T @ centred)[pairs], -together, together, ("between coordinates", np.array(pairs))),
+        ("correlation", correlations, -together, together, ("between coordinates", pairs)),
     ):
         wrong = np.flatnonzero(~((least <= values) & (values <= most)))
         if len(wrong):

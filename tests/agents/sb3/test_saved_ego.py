@@ -129,6 +129,19 @@ def test_loading_leaves_the_global_generators_alone_and_allocates_no_replay_buff
     assert len(set(drawn)) == 4
 
 
+def test_exploration_by_gsde_has_the_trained_deviations(tmp_path: Path) -> None:
+    for name in ("ppo", "sac"):
+        kind, options = {"ppo": (sb3.PPO, {}), "sac": (sb3.SAC, OFF_POLICY)}[name]
+        model = kind("MlpPolicy", Still(), use_sde=True, device="cpu", **options)
+        with torch.no_grad():
+            (model.policy if name == "ppo" else model.actor).log_std.fill_(-9.0)
+        model.save(tmp_path / name)
+        ego = load(tmp_path / f"{name}.zip")
+        seen = np.random.default_rng(3).normal(0.5, 2.0, (16, FEATURES)).astype(np.float32)
+        mean, drawn = (ego.predict(seen, deterministic=each)[0] for each in (True, False))
+        assert 0 < np.abs(drawn - mean).max() < 0.02
+
+
 class OwnPolicy(sb3.sac.policies.SACPolicy):
     """A user's subclass, whose module says nothing about the algorithm."""
 
