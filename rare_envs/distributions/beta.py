@@ -137,4 +137,8 @@ class BetaDistribution:
         """Return how far from the nearer end as a share of the range, and the shape parameters from there."""
         left, alpha, beta = u < 0.0, self.alpha[columns], self.beta[columns]
         first, second = np.where(left, alpha, beta), np.where(left, beta, alpha)
-        return np.asarray(special.betaincinv(first, second, special.ndtr(-np.abs(u)))), first, second
+        share = np.asarray(special.betaincinv(first, second, special.ndtr(-np.abs(u))))
+        lost = np.isnan(share)  # of probabilities under some 1e-160; there x^a / (a B(a, b)) is the distribution function
+        a, b = first[lost], second[lost]
+        share[lost] = np.exp((special.log_ndtr(-np.abs(u[lost])) + np.log(a) + special.betaln(a, b)) / a)
+        return share, first, second

@@ -129,7 +129,7 @@ def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
 
 def print_details(chosen: dict[str, Any]) -> None:
     """Print names that `choose_entries` returns with their meanings."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     for env_id, environment in chosen.get("environments", {}).items():
         _print_parameters(console, env_id, environment["parameters"])
         added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])

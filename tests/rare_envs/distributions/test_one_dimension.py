@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import betaln, log_ndtr
 
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.truncated_normal import TruncatedConditional, log_interval
@@ -147,3 +148,10 @@ def test_quantiles_near_an_end_that_cuts_the_bulk_off_are_exact(scale: float) ->
     assert ((x >= 0.0) & (x <= 1.0) & (np.diff(x, prepend=-1.0) > 0.0)).all()
     np.testing.assert_allclose(cut.to_normal(x)[u < 0], u[u < 0], atol=1e-12)
     np.testing.assert_allclose(cut.to_normal(x), u, atol=1e-7)  # near 1 the next number is further off
+
+
+def test_a_beta_variable_has_quantiles_however_far_out() -> None:
+    u = -np.arange(20.0, 38.0)[:, None]
+    x = BetaDistribution([4.0], [2.0], [0.0], [1.0]).from_standard_normal(u)[:, 0]
+    expected = (np.log(4.0) + betaln(4.0, 2.0) + log_ndtr(u[:, 0])) / 4.0  # P[X <= x] = x^4 / (4 B(4, 2)) there
+    np.testing.assert_allclose(np.log(x), expected, rtol=1e-12)
