@@ -106,7 +106,8 @@ def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:
         raise ValueError(f"Cannot read {where}: {error.strerror or error}.") from error
     except (SafetensorError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"Cannot read {where}, it is damaged, of another version, or no file of a result: {reason}.") from error
+        words = f"Cannot read {where}, it is damaged, of another version, or no file of a result: {reason}."
+        raise ValueError(words) from error
     if not isinstance(value, cls):
         raise ValueError(f"Expected {cls.__name__} in {where}, got {type(value).__name__}.")
     return value
