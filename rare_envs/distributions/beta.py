@@ -137,7 +137,7 @@ class BetaDistribution:
         """Return how far from the nearer end as a share of the range, and the shape parameters from there."""
         left, alpha, beta = u < 0.0, self.alpha[columns], self.beta[columns]
         first, second = np.where(left, alpha, beta), np.where(left, beta, alpha)
-        share = np.asarray(special.betaincinv(first, second, special.ndtr(-np.abs(u))))
+        share = np.asarray(special.betaincinv(first, second, special.ndtr(-np.abs(u))), dtype=np.float64)
         lost = np.isnan(share)  # of probabilities under 1e-160, where the distribution function is x^a / (a B(a, b))
         a, b = first[lost], second[lost]
         share[lost] = np.exp((special.log_ndtr(-np.abs(u[lost])) + np.log(a) + special.betaln(a, b)) / a)
