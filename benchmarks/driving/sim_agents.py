@@ -27,8 +27,6 @@ from torch import Tensor
 
 from training.data.table import DT
 
-POSE = 3
-"""Numbers in a pose: x along the road [m], y across it and positive to the right [m], heading [rad]."""
 AT_ONCE = 2
 """Rollouts whose pairs of agents are looked at together."""
 MAX_TIME_TO_COLLISION = 5.0
@@ -53,7 +51,8 @@ def motion_features(
     """Return the features of every agent at every step.
 
     Args:
-        states: Poses, shape (..., n_agents, T, 3); leading axes may be rollouts.
+        states: Poses, shape (..., n_agents, T, 3): x along the road [m], y across it and positive to the right [m],
+            heading [rad]; leading axes may be rollouts.
         valid: Where an agent is recorded, boolean, shape (n_agents, T). Elsewhere nobody sees it.
         sizes: Lengths and widths [m], shape (n_agents, 2).
         edges: y of the left and the right edge of the road [m].

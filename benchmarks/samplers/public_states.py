@@ -24,8 +24,6 @@ from samplers.problem import FloatArray
 
 RP8_MARGINALS = ((120.0, 12.0),) * 4 + ((50.0, 10.0), (40.0, 8.0))
 """Means and standard deviations of log-normal variables."""
-RP8_FACTORS = (1.0, 2.0, 2.0, 1.0, 5.0, 5.0)
-"""Of the strengths, then of the loads."""
 RP60_MARGINALS = ((2200.0, 220.0), (2100.0, 210.0), (2300.0, 230.0), (2000.0, 200.0), (1200.0, 480.0))
 RP38_MEANS = (350.0, 50.8, 3.81, 173.0, 9.38, 33.1, 0.036)
 """Of normal variables with a coefficient of variation of 0.1."""

@@ -75,17 +75,6 @@ def _road(lanes: int) -> Road:
     return Road(network, np_random=np.random.RandomState(0))
 
 
-def queue_road(vehicles: int, speed: float, gap: float) -> Road:
-    """Road with an ego behind others in one lane, all with one speed [m/s] and with one gap [m] between them."""
-    road = _road(1)
-    places = [(gap + Vehicle.LENGTH) * number for number in range(vehicles)]
-    road.vehicles = [
-        TianVehicle(road, [0.0, 0.0], 0.0, speed, target_speed=21.72, enable_lane_change=False),
-        *(Vehicle(road, [place, 0.0], 0.0, speed) for place in places[1:]),
-    ]
-    return road
-
-
 def car_following_road(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 21.72) -> Road:
     """Road with ego and lead.
 
