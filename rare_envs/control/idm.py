@@ -2,6 +2,9 @@
 
 References:
     Leurent, "An environment for autonomous driving decision-making", 2018: HighwayEnv, `vehicle/controller.py`.
+    Kesting, Treiber and Helbing, "Enhanced intelligent driver model to access the impact of driving strategies on
+    traffic capacity", Philosophical Transactions of the Royal Society A 368, 2010 (arXiv 0912.3613).
+    Treiber and Kesting, "Traffic Flow Dynamics", Springer, 2013, sections 11.3.7 and 11.3.8.
 """
 
 from __future__ import annotations
@@ -150,3 +153,69 @@ class IDM:
         _, y, heading, speed = episode.state.vehicles[0]
         steering = lane_keeping(y, heading, speed, episode.road)
         return torch.stack((self.acceleration(speed, episode.lead), steering)).T, memory
+
+
+COOLNESS = 0.99
+"""Weight of the constant-acceleration heuristic (Kesting, Treiber and Helbing 2010, table 1)."""
+
+
+def improved_acceleration(
+    idm: IDM,
+    speed: Tensor,
+    lead: Lead,
+    lead_acceleration: Tensor | float = 0.0,
+    desired_speed: Tensor | None = None,
+    coolness: Tensor | float = COOLNESS,
+) -> Tensor:
+    """Return accelerations [m/s^2] of the improved IDM with the constant-acceleration heuristic, (B,).
+
+    A driver behind a lead that has just come close does not brake for the gap as the IDM does, but by no more than what
+    avoids a contact if the lead keeps its acceleration ("eliminates unrealistic behaviour in cut-in situations").
+
+        improved: a_f = a (1 - (v/v0)^delta), z = s*/s;  a (1 - z^2) if z >= 1, else a_f (1 - z^(2 a / a_f));
+                  above v0: a_f = -b (1 - (v0/v)^(a delta / b));  a_f + a (1 - z^2) if z >= 1, else a_f
+        heuristic: a~ = min(a_lead, a);  v^2 a~ / (v_lead^2 - 2 s a~) if v_lead dv <= -2 s a~, else
+                  a~ - max(dv, 0)^2 / (2 s)
+        both:     the improved one where it is the larger, else (1 - c) improved + c (heuristic + b tanh((improved -
+                  heuristic) / b))
+
+    Args:
+        idm: Parameters; the result is within [-max_deceleration, max_acceleration].
+        speed: Own speeds v [m/s], (B,).
+        lead: Gaps s [m], inf for nobody, and closing speeds dv [m/s], (B,).
+        lead_acceleration: Of the lead [m/s^2].
+        desired_speed: v0 [m/s], by default that of `idm`.
+        coolness: c; 0 is the improved IDM alone.
+
+    Example:
+        >>> close = Lead(gap=torch.tensor([8.0]), closing_speed=torch.tensor([0.0]))
+        >>> motorway = IDM(33.0, 1.0, 1.0, 1.5, jam_distance=2.0, jam_distance_speed=0.0)
+        >>> motorway.acceleration(torch.tensor([20.0]), close).round(decimals=2).item()  # brakes for the gap
+        -5.0
+        >>> f"{improved_acceleration(motorway, torch.tensor([20.0]), close).item():.2f}"
+        '-1.55'
+    """
+    a, b, limit = idm.max_acceleration, idm.comfortable_deceleration, idm.max_deceleration
+    wanted = torch.full_like(speed, idm.desired_speed) if desired_speed is None else desired_speed
+    gap, closing = lead.gap.clamp_min(NEAR_ZERO), torch.where(torch.isfinite(lead.gap), lead.closing_speed, 0.0)
+    z = torch.where(torch.isfinite(gap), idm.interaction(speed, speed / wanted, lead).sqrt(), 0.0)
+    improved = _improve(a, b, idm.exponent, speed / wanted, z)
+    held = torch.clamp(torch.as_tensor(lead_acceleration, dtype=speed.dtype, device=speed.device), max=a)
+    ahead, room = speed - closing, 2.0 * gap
+    stopping = speed.square() * held / (ahead.square() - room * held).clamp_min(NEAR_ZERO)
+    closing_up = held - closing.clamp_min(0.0).square() / room
+    heuristic = torch.where(ahead * closing <= -room * held, stopping, closing_up)
+    heuristic = torch.where(torch.isfinite(gap), heuristic, improved)
+    milder = heuristic + b * torch.tanh((improved - heuristic) / b)
+    both = torch.where(improved >= heuristic, improved, (1.0 - coolness) * improved + coolness * milder)
+    return both.clamp(-limit, a)
+
+
+def _improve(a: float, b: float, exponent: float, ratio: Tensor, z: Tensor) -> Tensor:
+    """Return the improved IDM's acceleration [m/s^2] by v / v0 and s* / s, (B,) each."""
+    below = a * (1.0 - ratio.clamp(max=1.0).pow(exponent))
+    above = -b * (1.0 - ratio.clamp_min(1.0).pow(-a * exponent / b))
+    near = a * (1.0 - z.square())
+    share = torch.exp(2.0 * a / below.clamp_min(1e-3) * torch.log(z.clamp(1e-12, 1.0)))
+    slow = torch.where(z >= 1.0, near, below * (1.0 - share))
+    return torch.where(ratio <= 1.0, slow, above + near.clamp(max=0.0))

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rare_envs.control.idm import IDM, lane_keeping
+from rare_envs.control.idm import IDM, improved_acceleration, lane_keeping
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
 from tests.rare_envs.traffic_states import F64, tensor
@@ -86,3 +86,23 @@ def test_steering_on_the_line_is_the_same_beside_a_car_that_is_off_it_and_alone(
         alone = lane_keeping(y[:2], 0 * y[:2], speed[:2], straight(2))
     assert together.tolist()[:2] == alone.tolist() == [0.0, 0.0]
     assert together[2] < 0.0
+
+
+def test_the_heuristic_by_hand() -> None:
+    """v = 20 m/s, 10 m behind a lead of 18 m/s: s* = 2 + 20 + 20 x 2 / (2 sqrt(1.5)) = 38.3 m, so the improved IDM has
+    1 - 3.83^2 = -13.7; the heuristic -2^2 / 20 = -0.2; together .01 x -13.7 + .99 (-0.2 + 1.5 tanh(-9)) = -1.82."""
+    idm = IDM(1000.0, 1.0, 1.0, 1.5, jam_distance=2.0, jam_distance_speed=0.0, cut_off=True)
+    lead = Lead(torch.tensor([10.0], dtype=torch.float64), torch.tensor([2.0], dtype=torch.float64))
+    speed = torch.tensor([20.0], dtype=torch.float64)
+    z = (2 + 20 + 20 * 2 / (2 * math.sqrt(1.5))) / 10
+    whole = 0.01 * (1 - z**2) + 0.99 * (-0.2 + 1.5 * math.tanh((1 - z**2 + 0.2) / 1.5))
+    assert improved_acceleration(idm, speed, lead).item() == pytest.approx(whole)
+    # a lead that brakes by 3 m/s^2 to a standstill: v^2 a / (v_lead^2 - 2 s a) = -1200 / 384
+    heuristic = -3 * 400 / (18**2 + 2 * 10 * 3)
+    braking = improved_acceleration(idm, speed, lead, lead_acceleration=-3.0, coolness=1.0)
+    assert braking.item() == pytest.approx(heuristic + 1.5 * math.tanh((1 - z**2 - heuristic) / 1.5))
+    # nobody ahead, at the desired speed and above it: 0, and towards it by no more than b
+    alone = Lead(torch.tensor([math.inf], dtype=torch.float64), torch.tensor([0.0], dtype=torch.float64))
+    desired = [torch.tensor([20.0], dtype=torch.float64), torch.tensor([10.0], dtype=torch.float64)]
+    free = [improved_acceleration(idm, speed, alone, desired_speed=each).item() for each in desired]
+    assert free == pytest.approx([0.0, -1.5 * (1 - 0.5 ** (4 / 1.5))])
