@@ -188,6 +188,11 @@ TABLE = {
     ("100-Car", "near-crashes with a vehicle ahead"): (120, 108, 132, 9.0e-3),
     ("100-Car", "contacts begun by another's lane change"): (0.31, 0.01, 1.7, 2.3e-5),
     ("100-Car", "near-crashes begun by another's lane change"): (42, 36, 50, 3.2e-3),
+    ("100-Car", "contacts with a lead that stopped"): (4.0, 2.15, 6.9, 3.0e-4),
+    ("100-Car", "near-crashes with a lead that stopped"): (41, 34.3, 48.6, 3.1e-3),
+    ("100-Car", "contacts with a lead that slowed"): (0.0, 0.0, 1.15, 0.0),
+    ("100-Car", "near-crashes with a lead that slowed"): (47.2, 40.0, 55.4, 3.5e-3),
+    ("100-Car", "near-crashes in own lane changes into a vehicle that was not seen"): (13.7, 9.9, 18.4, 1.02e-3),
     ("SHRP 2", "crashes without tyre strikes"): (15, None, None, None),
     ("SHRP 2", "severe crashes"): (4.5, None, None, None),
 }

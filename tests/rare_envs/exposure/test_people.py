@@ -1,0 +1,92 @@
+"""People by kind of event, recounted from the study's table; and the factor by which a model misses them, by hand."""
+
+import csv
+
+import pytest
+
+from rare_envs.exposure import (
+    UNSEEN_CHANGES_100CAR,
+    EventCalibration,
+    ModelCount,
+    calibration,
+    people_in,
+)
+from tests.training.shared_data import DATA, needs_data
+
+EVENTS = "car100_events.csv"
+KM_100CAR = 2e6 * 1.609344
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Return the rows of the 828 events."""
+    with (DATA / EVENTS).open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@needs_data(EVENTS)
+def test_people_by_event_are_those_of_the_table(recorded):
+    def count(rows, severity):
+        return sum(row["severity"] == severity for row in rows)
+
+    striking = [row for row in recorded if row["group"] == "lead_slows"]
+    assert {row["incident_type"] for row in striking} == {"Rear-end, striking"}
+    by_event = {
+        "cut_in": [row for row in recorded if row["group"] == "cut_in"],
+        "stop": [row for row in striking if "stopped" in row["precipitating_event"]],
+        "slowing": [row for row in striking if "decelerating" in row["precipitating_event"]],
+    }
+    for event, rows in by_event.items():
+        people = people_in(event)
+        counted = (count(rows, "Crash"), count(rows, "Near-Crash"))
+        assert counted == (people.contacts.count, people.near_crashes.count)
+    types = [row["incident_type"].partition(",")[0] for row in by_event["cut_in"] if row["severity"] == "Near-Crash"]
+    assert (types.count("Rear-end"), types.count("Sideswipe")) == (74, 58)
+    own = [row for row in recorded if row["group"] == "own_lane_change"]
+    unseen = [row for row in own if any("Did not see other vehicle" in row[f"behaviour_{k}"] for k in (1, 2, 3))]
+    assert (len(own), count(own, "Crash")) == (76, 2)
+    assert (len(unseen), count(unseen, "Crash")) == (UNSEEN_CHANGES_100CAR.count, 0)
+
+
+def test_people_per_event_are_counts_over_events_in_as_many_km():
+    """1 contact (exact Poisson interval 0.0253 to 5.572) in 2 million miles; none is below 3.689."""
+    p, (low, high) = people_in("cut_in").contacts.per_event(0.26)
+    assert (p, low, high) == pytest.approx([k / KM_100CAR / 0.26 for k in (1.0, 0.02532, 5.572)], rel=1e-3)
+    p, (low, high) = people_in("slowing").contacts.per_event(1.04)
+    assert (p, low, high) == pytest.approx((0.0, 0.0, 3.689 / KM_100CAR / 1.04), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("model", "factor"),
+    [
+        (ModelCount(4e-5, 3e-5, 5e-5), 2.0),  # above the upper end
+        (ModelCount(1.5e-5, 1e-6, 9e-5), 1.0),  # inside, whatever its own interval
+        (ModelCount(2.5e-6, 1e-6, 9e-6), 0.25),  # below the lower end
+        (ModelCount(0.0, 0.0, 1e-4), 1.0),  # nothing counted, and too little simulated to tell
+        (ModelCount(0.0, 0.0, 5e-6), 0.5),  # nothing counted, below people's lower end by 2 or more
+    ],
+)
+def test_factor_by_which_a_model_misses_an_interval(model, factor):
+    assert model.factor_from(1e-5, 2e-5) == pytest.approx(factor)
+
+
+@pytest.mark.parametrize(("times", "calibrated"), [(2.9, True), (3.1, False)])
+def test_calibrated_is_within_a_factor_of_3_of_either_end(times, calibrated):
+    """13 contacts have the exact Poisson interval 6.92 to 22.23."""
+    low, high = (k / KM_100CAR / 0.19 for k in (6.922, 22.23))
+    for p in (high * times, low / times):
+        counts = {"human": {"contacts": ModelCount(p, p, p)}}
+        found = EventCalibration(event="stop", base="us101", per_km=0.19, drivers=counts, provisional=True)
+        assert found.is_calibrated == calibrated
+
+
+def test_the_shipped_calibration_has_every_event_and_both_drivers_of_the_bracket():
+    assert sorted(calibration()) == ["cut_in", "slowing", "stop"]
+    for event, found in calibration().items():
+        assert found.event == event
+        assert found.per_km > 0
+        for driver in ("human", "human:no-headway-rule"):
+            for outcome in ("contacts", "near_crashes"):
+                count = found.drivers[driver][outcome]
+                assert 0.0 <= count.low <= count.p <= count.high < 1.0
+                assert found.factor(outcome, driver) > 0.0
