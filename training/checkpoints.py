@@ -19,7 +19,7 @@ import torch
 
 from rare_envs.files import replace_file
 
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 """Version of the file."""
 COUNTERS = "num_timesteps _n_updates _episode_num _n_calls exploration_rate _current_progress_remaining".split()
 """Attributes of a model that count, where its algorithm has them."""
@@ -54,7 +54,7 @@ def save_checkpoint(path: Path, arguments: Mapping[str, Any], model: Any) -> Non
         "counters": {name: float(vars(model)[name]) for name in COUNTERS if name in vars(model)},
         "last": [_to_tensors(model._last_obs), _to_tensors(model._last_episode_starts)],
         "replay": _replay_state(vars(model).get("replay_buffer")),
-        "environment": monitor.venv.env.unwrapped.export_state(),
+        "environments": [batch.unwrapped.export_state() for batch in monitor.venv.batches],
         "monitor": _to_tensors({"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}),
         "generators": _generator_states(model),
     }
@@ -92,7 +92,8 @@ def restore_model(model: Any, state: Mapping[str, Any]) -> None:
         model._last_obs, model._last_episode_starts = (_to_arrays(one) for one in state["last"])
         _restore_replay(vars(model).get("replay_buffer"), state["replay"])
         monitor = model.get_env()
-        monitor.venv.env.unwrapped.restore_state(state["environment"])
+        for batch, episodes in zip(monitor.venv.batches, state["environments"], strict=True):
+            batch.unwrapped.restore_state(episodes)
         monitor.episode_returns[:] = _to_arrays(state["monitor"])["returns"]
         monitor.episode_lengths[:] = _to_arrays(state["monitor"])["lengths"]
         _restore_generators(model, state["generators"])

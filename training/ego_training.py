@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
@@ -125,7 +125,7 @@ class Retraining:
 
 
 def train_ego(
-    env_id: str,
+    env_id: str | Sequence[str],
     algo: str = "ppo",
     steps: int = 200_000,
     seed: int = 0,
@@ -135,6 +135,7 @@ def train_ego(
     resume: bool = False,
     checkpoint_interval: float = CHECKPOINT_SECONDS,
     retraining: Retraining | None = None,
+    even_strata: bool = True,
     **make_kwargs: Any,
 ) -> Path:
     """Train an ego and save it.
@@ -142,7 +143,7 @@ def train_ego(
     Equal arguments give equal weights on the same machine, whether the training was interrupted and resumed or not.
 
     Args:
-        env_id: Environment id, such as "rare_envs/CutIn-v0".
+        env_id: Environment id, such as "rare_envs/CutIn-v0", or several whose observations have one space.
         algo: One of `HYPERPARAMETERS`: "ppo", "a2c", "sac", "td3", "dqn".
         steps: Environment steps, summed over the batch; rounded up to whole rollouts.
         seed: Seed of the networks, the exploration and the scenarios.
@@ -151,7 +152,10 @@ def train_ego(
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
         checkpoint_interval: Time between checkpoints [s]; the last one is removed when the ego is saved.
-        retraining: An ego to go on from, in place of a new one, and failures that are mixed into the scenarios.
+        retraining: An ego to go on from, in place of a new one, and failures of the one environment, which are mixed
+            into the scenarios.
+        even_strata: Draw the strata of base distributions equally often, whatever their shares: an ego that meets a
+            cutter who does not look once in 7,000 episodes does not learn to expect one.
         **make_kwargs: Keyword arguments of `gym.make_vec` for this environment; `device` places networks that
             see pictures too.
 
@@ -180,9 +184,15 @@ def train_ego(
         raise ValueError(f"Expected a seed from 0 to 2^32 - 1, got {seed}.")
     from rare_envs.scenarios.registry import find_scenario
 
-    find_scenario(env_id)
+    ids = (env_id,) if isinstance(env_id, str) else tuple(env_id)
+    for each in ids:
+        find_scenario(each)
+    if not ids or len(set(ids)) < len(ids) or (retraining is not None and len(ids) > 1):
+        which = "one environment to train on in" if retraining else "different environments, one or more"
+        raise ValueError(f"Expected {which}, got {', '.join(ids) or 'none'}.")
     target, device = _prepare_target(Path(out)), make_kwargs.get("device", "cpu")
-    arguments = {"env_id": env_id, "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
+    arguments = {"env_id": ",".join(ids), "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
+    arguments |= {"even_strata": even_strata}
     arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
     arguments |= {} if retraining is None else retraining.arguments()
     checkpoint = target.with_suffix(CHECKPOINT_SUFFIX)
@@ -195,7 +205,7 @@ def train_ego(
     from training.vec_env import sb3_vec_env
 
     hyperparameters = HYPERPARAMETERS[algo]
-    env = sb3_vec_env(env_id, num_envs, discrete=hyperparameters.discrete, **make_kwargs)
+    env = sb3_vec_env(ids, num_envs, discrete=hyperparameters.discrete, even_strata=even_strata, **make_kwargs)
     try:
         with use_one_thread(), _progress_bar(progress) as bar:
             settings = _fit_to_run(hyperparameters, num_envs, steps)

@@ -1,9 +1,11 @@
-"""The batched simulation as a Stable-Baselines3 `VecEnv`."""
+"""The batched simulation, of one scenario or of several, as a Stable-Baselines3 `VecEnv`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -11,33 +13,39 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
+from rare_envs.distributions.coordinates import FloatArray
+from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.simulation.observation import map_kinds
 
 Indices = int | Iterable[int] | None
 
 
 def sb3_vec_env(
-    id: str,
+    id: str | Sequence[str],
     num_envs: int,
     seed: int | None = None,
     discrete: bool = False,
+    even_strata: bool = False,
     **make_kwargs: Any,
 ) -> VecMonitor:
-    """Open an environment of ours for Stable-Baselines3: one batched simulation, many episodes.
+    """Open environments of ours for Stable-Baselines3: a batched simulation of each id, many episodes.
 
     Args:
-        id: Environment id, such as "rare_envs/CutIn-v0".
-        num_envs: Number of episodes that run side by side.
+        id: Environment id, such as "rare_envs/CutIn-v0", or several whose observations have one space.
+        num_envs: Number of episodes that run side by side; several ids share them evenly.
         seed: Seed of the first reset; an algorithm's own seed replaces it.
         discrete: Offer the rows of `rare_envs.control.actions.DISCRETE_ACTIONS` as a `Discrete` action
             space, for algorithms such as DQN; an environment with `action="meta"` has one already.
-        **make_kwargs: Keyword arguments of `gym.make` for this environment.
+        even_strata: Draw the strata of a base distribution equally often, whatever their shares, so that a policy
+            meets the rare ones: of the cutters of CutIn-v1 one in 7,000 does not look.
+        **make_kwargs: Keyword arguments of `gym.make` for these environments.
 
     Returns:
         A `VecEnv` that also records returns and lengths of episodes.
 
     Raises:
-        ValueError: `num_envs` is not positive, or the environment refuses an argument.
+        ValueError: `num_envs` is less than the number of ids, the environments differ in their spaces, or one refuses
+            an argument.
 
     Example:
         >>> env = sb3_vec_env("rare_envs/CutIn-v0", num_envs=4, seed=0)
@@ -50,14 +58,34 @@ def sb3_vec_env(
     import rare_envs
     from rare_envs.control.actions import DISCRETE_ACTIONS
 
-    if num_envs < 1:
-        raise ValueError(f"Expected num_envs >= 1, got {num_envs}.")
-    batch = rare_envs.make_batch(id, num_envs, **make_kwargs)
-    continuous = isinstance(batch.single_action_space, gym.spaces.Box)
-    env = BatchedVecEnv(batch, np.asarray(DISCRETE_ACTIONS) if discrete and continuous else None)
+    ids = (id,) if isinstance(id, str) else tuple(id)
+    if not ids or num_envs < len(ids):
+        raise ValueError(f"Expected num_envs >= {max(len(ids), 1)}, got {num_envs}.")
+    sizes = [num_envs // len(ids) + (number < num_envs % len(ids)) for number in range(len(ids))]
+    batches = [rare_envs.make_batch(each, size, **make_kwargs) for each, size in zip(ids, sizes, strict=True)]
+    for batch in batches if even_strata else ():
+        own: Any = batch.unwrapped
+        own.space = _even_out(own.space)
+    continuous = isinstance(batches[0].single_action_space, gym.spaces.Box)
+    env = BatchedVecEnv(*batches, discrete_actions=np.asarray(DISCRETE_ACTIONS) if discrete and continuous else None)
     if seed is not None:
         env.seed(seed)
     return VecMonitor(env)
+
+
+def _even_out(space: ScenarioSpace) -> ScenarioSpace:
+    """Return the space of an environment that draws the strata of its base equally often, if there are any."""
+    strata = getattr(space.base, "strata", None) or ()
+    if len(strata) < 2:
+        return space
+
+    def sample(n: int, rng: np.random.Generator) -> FloatArray:
+        which, x = rng.integers(len(strata), size=n), np.empty((n, space.dim))
+        for number, stratum in enumerate(strata):
+            x[which == number] = stratum.base.sample(int((which == number).sum()), rng)
+        return x
+
+    return replace(space, base=cast(Distribution, SimpleNamespace(sample=sample)))  # an environment only draws
 
 
 def sb3_agents_env(
@@ -102,77 +130,101 @@ def sb3_agents_env(
 
 
 class BatchedVecEnv(VecEnv):
-    """Adapter from a Gymnasium `VectorEnv` with same-step autoreset to a `VecEnv`.
+    """Adapter from Gymnasium `VectorEnv`s with same-step autoreset, one or several side by side, to a `VecEnv`.
 
     The infos of a step are empty except for episodes that ended in it: those hold what the environment said of the
     end, `terminal_observation` and `TimeLimit.truncated`. Seed and options apply to the next reset. All environments
-    live in one simulation, so attributes and methods are those of the batch.
+    of a batch live in one simulation, so attributes and methods are those of the batch.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], discrete_actions: NDArray[Any] | None = None) -> None:
-        """Wrap a batch with same-step autoreset; continuous actions (K, 2) may be chosen from by index."""
-        mode = env.metadata.get("autoreset_mode")
-        if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(f"Expected a VectorEnv with same-step autoreset, got {mode}.")
-        self.env = env
+    def __init__(
+        self, *batches: VectorEnv[Any, Any, Any], discrete_actions: NDArray[Any] | None = None
+    ) -> None:
+        """Wrap batches with equal spaces; continuous actions (K, 2) may be chosen from by index."""
+        first = batches[0]
+        for batch in batches:
+            mode = batch.metadata.get("autoreset_mode")
+            if mode != AutoresetMode.SAME_STEP:
+                raise ValueError(f"Expected a VectorEnv with same-step autoreset, got {mode}.")
+            for name in ("single_observation_space", "single_action_space"):
+                one, other = getattr(first, name), getattr(batch, name)
+                if one != other:
+                    raise ValueError(f"Expected environments with one {name}, got {one} and {other}.")
+        self.batches = batches
+        ends = np.cumsum([batch.num_envs for batch in batches]).tolist()
+        self._rows = [slice(end - batch.num_envs, end) for batch, end in zip(batches, ends, strict=True)]
         self._table = discrete_actions
         self._actions: NDArray[Any] | None = None
-        action_space = env.single_action_space
+        action_space = first.single_action_space
         if discrete_actions is not None:
             action_space = gym.spaces.Discrete(len(discrete_actions))
-        super().__init__(env.num_envs, env.single_observation_space, action_space)
+        super().__init__(ends[-1], first.single_observation_space, action_space)
 
     def reset(self) -> Any:
         """Start new episodes everywhere, with the seed and options set before, if any."""
-        options = merge_options(self._options)
-        observation, infos = self.env.reset(seed=self._seeds[0], options=options)
-        self.reset_infos = [info_row(infos, row) for row in range(self.num_envs)]
+        observations = []
+        self.reset_infos = []
+        for batch, rows in zip(self.batches, self._rows, strict=True):
+            options = merge_options(self._options[rows])
+            observation, infos = batch.reset(seed=self._seeds[rows.start], options=options)
+            self.reset_infos += [info_row(infos, row) for row in range(batch.num_envs)]
+            observations.append(observation)
         self._reset_seeds()
         self._reset_options()
-        return map_kinds(np.asarray, observation)
+        return _join(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for `step_wait`, shape (B, 2), or (B,) for discrete ones."""
         self._actions = actions if self._table is None else self._table[actions]
 
     def step_wait(self) -> tuple[Any, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
-        """Advance the batch by one step; ended episodes are followed by new ones at once."""
-        observation, reward, terminated, truncated, infos = self.env.step(self._actions)
+        """Advance the batches by one step; ended episodes are followed by new ones at once."""
+        assert self._actions is not None
+        parts = [self._step(*each) for each in zip(self.batches, self._rows, strict=True)]
+        observation, reward, done, infos = zip(*parts, strict=True)
+        return _join(observation), np.concatenate(reward), np.concatenate(done), [row for part in infos for row in part]
+
+    def _step(self, batch: VectorEnv[Any, Any, Any], rows: slice) -> tuple[Any, ...]:
+        """Advance one batch; return its observations, rewards, ends and infos."""
+        assert self._actions is not None
+        observation, reward, terminated, truncated, infos = batch.step(self._actions[rows])
         done = np.logical_or(terminated, truncated)
-        rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ends: list[dict[str, Any]] = [{} for _ in range(batch.num_envs)]
         for row in np.flatnonzero(done).tolist():
-            rows[row] = info_row(infos.get("final_info", {}), row)
-            rows[row]["terminal_observation"] = map_kinds(np.asarray, infos["final_obs"][row])
-            rows[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
-            self.reset_infos[row] = info_row(infos, row)
-        return map_kinds(np.asarray, observation), np.asarray(reward, dtype=np.float32), done, rows
+            ends[row] = info_row(infos.get("final_info", {}), row)
+            ends[row]["terminal_observation"] = map_kinds(np.asarray, infos["final_obs"][row])
+            ends[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
+            self.reset_infos[rows.start + row] = info_row(infos, row)
+        return observation, np.asarray(reward, dtype=np.float32), done, ends
 
     def close(self) -> None:
-        """Close the batch."""
-        self.env.close()
+        """Close the batches."""
+        for batch in self.batches:
+            batch.close()
 
     def get_images(self) -> Sequence[NDArray[Any] | None]:
-        """Return images of the environments, as many as the batch renders."""
-        frames: Any = self.env.render()
-        return list(frames or ())
+        """Return images of the environments, as many as the batches render."""
+        frames: list[Any] = [batch.render() for batch in self.batches]
+        return [image for part in frames for image in part or ()]
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Return the batch's attribute, once for each of the environments."""
-        value = self._find(attr_name)
-        return [value for _ in self._get_indices(indices)]
+        """Return the attribute of its batch, for each of the environments."""
+        values = [value for batch in self.batches for value in [_find(batch, attr_name)] * batch.num_envs]
+        return [values[row] for row in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute of the batch; for all environments or not at all."""
-        self._refuse_part(indices, attr_name)
-        setattr(self.env.unwrapped, attr_name, value)
+        """Set an attribute of batches; for all environments of one or for none."""
+        for batch in self._chosen(indices, attr_name):
+            setattr(batch.unwrapped, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the batch once, for all environments; its result stands for each."""
-        self._refuse_part(indices, method_name)
-        result = self._find(method_name)(*method_args, **method_kwargs)
-        return [result for _ in range(self.num_envs)]
+        """Call a method of a batch once, for all of its environments; its result stands for each."""
+        found: list[Any] = []
+        for batch in self._chosen(indices, method_name):
+            found += [_find(batch, method_name)(*method_args, **method_kwargs)] * batch.num_envs
+        return found
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
@@ -181,19 +233,30 @@ class BatchedVecEnv(VecEnv):
         del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
-    def _find(self, name: str) -> Any:
-        """Return an attribute of the batch or of the environment inside its wrappers."""
-        # the name comes from Stable-Baselines3
-        return getattr(self.env if hasattr(self.env, name) else self.env.unwrapped, name)
+    def _chosen(self, indices: Indices, name: str) -> list[VectorEnv[Any, Any, Any]]:
+        """Return the batches with these rows; refuse a part of one, whose environments share one simulation."""
+        asked, found = set(self._get_indices(indices)), list[VectorEnv[Any, Any, Any]]()
+        for batch, rows in zip(self.batches, self._rows, strict=True):
+            own = set(range(rows.start, rows.stop))
+            if asked & own and not own <= asked:
+                raise ValueError(
+                    f"Expected {name!r} for all {batch.num_envs} environments, got {sorted(asked & own)}: "
+                    "they share one batched simulation; leave indices out."
+                )
+            found += [batch] if own <= asked else []
+        return found
 
-    def _refuse_part(self, indices: Indices, name: str) -> None:
-        """Refuse indices that leave some out: the environments share one simulation and cannot differ."""
-        asked = set(self._get_indices(indices))
-        if asked != set(range(self.num_envs)):
-            raise ValueError(
-                f"Expected {name!r} for all {self.num_envs} environments, got {sorted(asked)}: "
-                "they share one batched simulation; leave indices out."
-            )
+
+def _join(observations: Sequence[Any]) -> Any:
+    """Return the observations of batches below each other; those of one as they are."""
+    if len(observations) == 1:
+        return map_kinds(np.asarray, observations[0])
+    return map_kinds(lambda *parts: np.concatenate(parts), *observations)
+
+
+def _find(batch: VectorEnv[Any, Any, Any], name: str) -> Any:
+    """Return an attribute of a batch or of the environment inside its wrappers; Stable-Baselines3 names it."""
+    return getattr(batch if hasattr(batch, name) else batch.unwrapped, name)
 
 
 def merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:

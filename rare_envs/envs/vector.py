@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.devices import find_device, move_to
+from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.envs.rendering import Renderer
 from rare_envs.envs.rows_and_infos import (
     DrawsAhead,
@@ -93,7 +94,6 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self.single_action_space = self.world.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._ahead = DrawsAhead(self.space.base)
         self._x = np.full((num_envs, self.space.dim), np.nan)
         self._tick = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
@@ -101,6 +101,15 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._episode: Episode | None = None
         self._renderer = Renderer(self.world, render_mode)
         self._compiled = find_scripted_step(self.world, core) if self.device.type == "cpu" else None
+
+    @property
+    def space(self) -> ScenarioSpace:
+        """The scenario space; from the base distribution of one that is set the next episodes are drawn."""
+        return self._space
+
+    @space.setter
+    def space(self, value: ScenarioSpace) -> None:
+        self._space, self._ahead = value, DrawsAhead(value.base)
 
     @property
     def np_random(self) -> np.random.Generator:

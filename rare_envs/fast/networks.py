@@ -14,7 +14,7 @@ from rare_envs.egos.dense_policies import DensePolicy
 from rare_envs.fast import equations as eq
 from rare_envs.fast.equations import compiled, compiled_fused, single
 from rare_envs.fast.rows import UNKNOWN, Rows, SingleArray
-from rare_envs.simulation.observation import CLIP, EGO_SCALES, OTHER_SCALES
+from rare_envs.simulation.observation import CLIP, EGO_SCALES, OTHER_SCALES, count_features
 
 LANES = 64
 """Rows side by side, a number that the compiler knows."""
@@ -23,6 +23,7 @@ AT_ONCE = 4
 _NOTHING, _BOUND, _ACCELERATION, _STEERING = single(np.nan, CLIP, MAX_ACCELERATION, MAX_STEERING)
 _SPEED, _Y, _HEADING = single(*EGO_SCALES.values())
 _GAP, _RELATIVE_SPEED, _RELATIVE_Y, _LATERAL_SPEED = single(*OTHER_SCALES.values())
+_LEAST_FEATURES = count_features(vehicles=1)
 _CHOICES = DISCRETE_ACTIONS.astype(np.float32)
 (_LIMIT,) = single(7.905311)
 """Beyond 7.9 the hyperbolic tangent is 1 in single precision."""
@@ -100,7 +101,7 @@ def pad(width: int) -> int:
 @compiled
 def decide_by_policy(rows: Rows, policy: PolicyNumbers, values: SingleArray, spare: SingleArray) -> None:
     """Decide for at most `LANES` egos, f of failing ones is `UNKNOWN`; writes over two (widest layer, `LANES`)."""
-    values[4 * len(rows.x) - 1 : policy.widths[0]] = eq.ZERO
+    values[max(4 * len(rows.x) - 1, _LEAST_FEATURES) : policy.widths[0]] = eq.ZERO
     observe(rows, values)
     normalise(policy, values, rows.size)
     apply_layers(policy, values, spare)
@@ -131,6 +132,10 @@ def observe(rows: Rows, values: SingleArray) -> None:
     for feature in range(4 * len(rows.x) - 1):
         for row in range(rows.size):
             values[feature, row] = eq.clip(values[feature, row], -_BOUND, _BOUND)
+    for missing in range(4 * len(rows.x) - 1, _LEAST_FEATURES, 4):
+        for row in range(rows.size):
+            values[missing, row] = _BOUND
+            values[missing + 1, row] = values[missing + 2, row] = values[missing + 3, row] = eq.ZERO
 
 
 @compiled

@@ -33,6 +33,7 @@ from rare_envs.scenarios.cut_in import CUTTER_IDM
 from rare_envs.simulation import decision as reward
 from rare_envs.simulation.decision import RewardTerms, StepResult
 from rare_envs.simulation.episode import Episode, EpisodeStatistics
+from rare_envs.simulation.observation import count_features
 from rare_envs.traffic import crash
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import Road
@@ -162,7 +163,7 @@ class Stepped(NamedTuple):
 def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> StepResult:
     """Carry out accelerations [m/s^2] and steering angles [rad] of the egos (B, 2) for a tick of B episodes."""
     old, f, vehicles = episode.state, episode.measure_state.numpy(), episode.state.x.shape[1]
-    start, rooms = stack_state(old), (np.empty((n, len(f)), dtype=np.float32) for n in (2, 6, 4 * vehicles - 1))
+    start, rooms = stack_state(old), (np.empty((n, len(f)), dtype=np.float32) for n in (2, 6, count_features(vehicles)))
     table, stepped, tensor = make_table(start, vehicles, len(f)), Stepped(f.copy(), *rooms), torch.from_numpy
     eventful = step(table, vehicles, action, script, stepped)
     before, after = (each[: 4 * vehicles].reshape(4, vehicles, len(f)) for each in (start, table))

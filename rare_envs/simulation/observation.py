@@ -108,6 +108,9 @@ EGO_SCALES = {"speed": 30.0, "y": LANE_WIDTH, "heading": 0.1}
 OTHER_SCALES = {"gap": 50.0, "relative_speed": 10.0, "relative_y": LANE_WIDTH, "lateral_speed": 2.0}
 """Likewise of each other vehicle, [m] and [m/s]: bumper gap along the road (negative beside or behind), its speed along
 the road less the ego's, its position across the road less the ego's, its speed across the road."""
+LEAST_OTHERS = 2
+"""Other vehicles in `features` at least, so that one policy fits scenarios of two and of three vehicles. One that is
+not there is ahead of the ego, as far as features tell and as fast."""
 
 _CORE_SCALES = (LANE_WIDTH, 0.1, 30.0, VEHICLE_LENGTH, 2.0, 0.01, LANE_WIDTH, LANE_WIDTH, 1.0, 1.0, 1.0)
 LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
@@ -117,8 +120,9 @@ LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
 def observation_space(vehicles: int, observation: str = "features", camera: Camera | None = None) -> spaces.Space[Any]:
     """Return the space of an observation among N vehicles; of several joined by "+" a `Dict`.
 
-    "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics": HighwayEnv's 5 x 5;
-    "camera": an image, uint8, H x W x 3, as large as the camera says; "speed": all that a camera does not show of it.
+    "features": 3 of the ego, then 4 of each other vehicle, of `LEAST_OTHERS` at least; "lidar": the ego's 51;
+    "kinematics": HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3, as large as the camera says; "speed": all
+    that a camera does not show of it.
     """
     kinds = observation.split("+")
     if len(kinds) > 1:
@@ -131,8 +135,13 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
         return spaces.Box(-np.inf, np.inf, (KINEMATICS_ROWS, len(KINEMATICS_FEATURES)), np.float32)
     if observation == "speed":
         return spaces.Box(-CLIP, CLIP, (1,), np.float32)
-    size = len(LIDAR_SCALES) if observation == "lidar" else len(EGO_SCALES) + len(OTHER_SCALES) * (vehicles - 1)
+    size = len(LIDAR_SCALES) if observation == "lidar" else count_features(vehicles)
     return spaces.Box(-CLIP, CLIP, (size,), np.float32)
+
+
+def count_features(vehicles: int) -> int:
+    """Return the number of `features` among N vehicles."""
+    return len(EGO_SCALES) + len(OTHER_SCALES) * max(vehicles - 1, LEAST_OTHERS)
 
 
 def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
@@ -160,7 +169,7 @@ def observe(episode: Episode, observation: str, vehicle: int = 0) -> Any:
 
 
 def observe_features(state: State) -> Tensor:
-    """Return the `features` of the ego, (B, 3 + 4 (N - 1)), float32: its own, then those of each other vehicle."""
+    """Return the `features` of the ego, (B, `count_features`), float32: its own, then those of each other vehicle."""
     (ego, *others), (length,) = state.vehicles, scalars((VEHICLE_LENGTH,), state.x)
     values, along = [ego.speed, ego.y, ego.heading], ego.speed * torch.cos(ego.heading)
     for other in others:
@@ -170,5 +179,8 @@ def observe_features(state: State) -> Tensor:
             other.y - ego.y,
             other.speed * torch.sin(other.heading),
         ]
+    missing = max(LEAST_OTHERS - len(others), 0)
     scales = constant((*EGO_SCALES.values(), *[*OTHER_SCALES.values()] * len(others)), state.x)
-    return (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP).float()
+    seen = (torch.stack(values, dim=1) / scales).clamp(-CLIP, CLIP)
+    away = constant((CLIP, *(0.0,) * (len(OTHER_SCALES) - 1)) * missing, state.x).expand(len(seen), -1)
+    return torch.cat((seen, away), dim=1).float()

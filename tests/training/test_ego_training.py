@@ -200,6 +200,42 @@ def egos(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return cache(lambda algo: train_ego(ENV, algo, STEPS, num_envs=ROWS, out=folder / f"{algo}.zip", progress=False))
 
 
+def test_an_ego_is_trained_in_several_scenarios(tmp_path: Path) -> None:
+    ids = ("rare_envs/HardBrake-v0", ENV)
+    common: dict[str, Any] = {"steps": STEPS, "num_envs": ROWS, "progress": False, "horizon": 0.8}
+    whole = train_ego(ids, out=tmp_path / "both.zip", **common)
+    for each in ids:
+        problem = DrivingProblem(each, ego=load_ego(whole))
+        assert np.isfinite(problem.evaluate(problem.base.sample(4, np.random.default_rng(0)))).all()
+    for wrong in ((), (ENV, ENV)):
+        with pytest.raises(ValueError, match="different environments, one or more"):
+            train_ego(wrong, out=tmp_path / "none.zip", **common)
+    with pytest.raises(ValueError, match="one environment to train on in"):
+        train_ego(ids, out=tmp_path / "none.zip", retraining=Retraining(whole, FAILURE), **common)
+
+
+def test_a_resumed_training_in_several_scenarios_ends_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ids = ("rare_envs/HardBrake-v0", ENV)
+    common: dict[str, Any] = {"steps": 480, "num_envs": ROWS, "progress": False, "horizon": 0.8}
+    whole = train_ego(ids, out=tmp_path / "whole.zip", **common)
+    stop_after(monkeypatch, 2)
+    with pytest.raises(Stopped):
+        train_ego(ids, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
+    monkeypatch.undo()
+    resumed = train_ego(ids, out=tmp_path / "ego.zip", resume=True, **common)
+    assert torch.equal(weights(resumed), weights(whole))
+
+
+def test_episodes_that_follow_begin_in_failures_too() -> None:
+    """With episodes of one step nearly all begin after another one; the count is binomial, to 5 deviations."""
+    env = sb3_vec_env(ENV, 8, seed=0, horizon=0.1)
+    env.set_attr("space", Retraining(Path("ego.zip"), FAILURE, 0.5).mix(env.get_attr("space")[0]))
+    env.reset()
+    infos = [info for _ in range(100) for info in env.step(np.zeros((8, 2), np.float32))[3]]
+    failed = sum(bool((info["x"] == FAILURE[0]).all()) for info in infos)
+    assert failed == pytest.approx(400, abs=5 * (800 * 0.25) ** 0.5)
+
+
 def test_the_share_of_failures_is_drawn_and_the_rest_is_of_the_base() -> None:
     space, failures = rare_envs.make_batch(ENV, 1).space, np.concatenate((FAILURE, FAILURE + 1.0))
     x = Retraining(Path("ego.zip"), failures, 0.3).mix(space).base.sample(20_000, np.random.default_rng(0))

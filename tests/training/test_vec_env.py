@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -66,11 +67,11 @@ def batch(*lengths: int, limit: int = 1000, mode: Any = AutoresetMode.SAME_STEP)
 # --- the adapter, against a batch whose answers are known --------------------------------------
 
 
-def test_it_agrees_with_the_vec_env_of_stable_baselines() -> None:
+@pytest.mark.parametrize("batches", [((2, 3, 7),), ((2, 3), (7,))])
+def test_it_agrees_with_the_vec_env_of_stable_baselines(batches: tuple[tuple[int, ...], ...]) -> None:
     rng = np.random.default_rng(0)
-    lengths = (2, 3, 7)
-    makers = [lambda length=length: Countdown(length, limit=5) for length in lengths]
-    ours, theirs = BatchedVecEnv(batch(*lengths, limit=5)), DummyVecEnv(makers)
+    makers = [lambda length=length: Countdown(length, limit=5) for part in batches for length in part]
+    ours, theirs = BatchedVecEnv(*(batch(*part, limit=5) for part in batches)), DummyVecEnv(makers)
     ours.seed(4)
     theirs.seed(4)
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
@@ -102,7 +103,7 @@ def test_it_agrees_with_the_vec_env_of_stable_baselines() -> None:
 
 def test_discrete_actions_are_looked_up() -> None:
     table = np.array([[-1.0, 0.0], [0.25, 0.5]], np.float32)
-    env = BatchedVecEnv(batch(9, 9), table)
+    env = BatchedVecEnv(batch(9, 9), discrete_actions=table)
     assert env.action_space == spaces.Discrete(2)
     env.reset()
     observation = env.step(np.array([1, 0]))[0]
@@ -136,6 +137,37 @@ def test_reset_options_reach_our_environments() -> None:
     inner: Any = env.unwrapped
     gaps = [info["scenario"]["cut_in_gap"] for info in inner.reset_infos]
     assert gaps == pytest.approx([9.0, 12.0])
+
+
+def test_scenarios_side_by_side_have_one_observation() -> None:
+    """A vehicle that is not there is ahead as far as features tell, and as fast as the ego."""
+    env = sb3_vec_env((FOLLOWING, CUT_IN), 5, seed=0)
+    observation = env.reset()
+    assert observation.shape == (5, 11)
+    assert observation[:3, 7:].tolist() == [[5.0, 0.0, 0.0, 0.0]] * 3
+    assert (observation[3:, 7] < 5.0).all()
+    actions = np.tile(np.array([0.3, 0.0], np.float32), (5, 1))
+    moved = env.step(actions)[0]
+    alone = [sb3_vec_env(each, size, seed=seed) for each, size, seed in ((FOLLOWING, 3, 0), (CUT_IN, 2, 3))]
+    np.testing.assert_array_equal(observation, np.concatenate([one.reset() for one in alone]))
+    np.testing.assert_array_equal(moved, np.concatenate([one.step(actions[: one.num_envs])[0] for one in alone]))
+    space = env.get_attr("space", indices=4)[0]
+    assert "cut_in_gap" in space.names
+    env.set_attr("space", space, indices=[3, 4])
+    with pytest.raises(ValueError, match="one single_observation_space"):
+        sb3_vec_env((CUT_IN, "rare_envs/Highway-v0"), 2)
+
+
+def test_strata_are_drawn_evenly_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two strata with shares 0.99 and 0.01 each is half of the draws: a binomial count, to 5 deviations."""
+    low, high = np.array([14.0, 14.0, 5.0]), np.array([16.0, 16.0, 50.0])
+    parts = [BetaDistribution(np.full(3, 2.0), np.full(3, 2.0), low, top) for top in (high, high - [0, 0, 40.0])]
+    strata = [SimpleNamespace(name=name, base=base) for name, base in zip(("far", "near"), parts, strict=True)]
+    monkeypatch.setattr(BetaDistribution, "strata", strata, raising=False)
+    space = sb3_vec_env(FOLLOWING, 1, base=parts[0], even_strata=True).get_attr("space")[0]
+    gaps = space.base.sample(4_000, np.random.default_rng(0))[:, 2]
+    far = (gaps > 10.0).mean() / (parts[0].sample(4_000, np.random.default_rng(1))[:, 2] > 10.0).mean()
+    assert far == pytest.approx(0.5, abs=5 * 0.5 / 4_000**0.5)
 
 
 # --- several agents ---------------------------------------------------------------------------

@@ -43,6 +43,7 @@ rare-envs export runs/cutin --out crash.xml --format commonroad
 rare-envs fit --highd path/to/highD/data --out bases --name cologne
 rare-envs fit --tgsim path/to/tgsim --cut-gaps --scenario cut_in --out bases
 rare-envs train-ego rare_envs/CutIn-v0 --steps 200000 --out ppo.zip
+rare-envs train-ego all --steps 400000 --out ppo.zip
 rare-envs train-ego rare_envs/CutIn-v0 --algo dqn --out dqn.zip
 rare-envs train-drivers --highd path/to/highD/data --out runs/drivers --method gail
 rare-envs check-ego ppo.zip rare_envs/CutIn-v0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -27,12 +27,11 @@ USUAL = {"noise": "on", "observation": "features", "action": "continuous", "coll
 @command(*shell.WORLD, "seed", "trust")
 def train_ego_command(
     asked: dict[str, Any],
-    env: Annotated[
-        str | None,
+    envs: Annotated[
+        list[str] | None,
         Argument(
-            metavar="[ENV]",
-            help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it.",
-            callback=shell.read_environment,
+            metavar="[ENV]...",
+            help="Environments, such as rare_envs/CutIn-v1, or all: those of rare-envs risk; --from-failures tells it.",
         ),
     ] = None,
     algo: Annotated[
@@ -56,29 +55,40 @@ def train_ego_command(
     failure_share: Annotated[
         float, Option(help="Share of episodes that begin in a failure, with --from-failures.")
     ] = 0.25,
+    even_strata: Annotated[
+        bool,
+        Option(
+            "--even-strata/--shares",
+            help="Draw the kinds of an event equally often, or as often as they happen: of the cutters of CutIn-v1 "
+            "one in 7,000 does not look.",
+        ),
+    ] = True,
 ) -> Answer:
-    """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`.
+    """Train an ego on the batched simulation and save it for `rare-envs estimate --ego` and `rare-envs risk`.
 
-    A new one in ENV, or by --from-failures the ego of a run, in the world of that run.
+    A new one in the environments, all of them at once, or by --from-failures the ego of a run, in the world of that
+    run.
     """
     from training import train_ego
     from training.ego_training import HYPERPARAMETERS
 
     seed, trust = asked.pop("seed"), asked.pop("trust")
-    plan = None
+    ids, plan = _read_environments(envs or []), None
     if from_failures:
-        plan = _read_plan(from_failures, failure_share, trust, env, algo, asked)
-        env, algo, world = plan.env_id, plan.algo, dict(plan.world)
-    elif env is None:
-        raise BadInput("Expected an environment, such as rare_envs/CutIn-v0, or --from-failures RUN; rare-envs list.")
+        plan = _read_plan(from_failures, failure_share, trust, ids, algo, asked)
+        ids, algo, world = (plan.env_id,), plan.algo, dict(plan.world)
+    elif not ids:
+        raise BadInput("Expected an environment, such as rare_envs/CutIn-v1, or --from-failures RUN; rare-envs list.")
     else:
         algo = algo or "ppo"
         world = {**asked, **{name: asked[name] or USUAL[name] for name in ("observation", "action")}}
     retraining = None if plan is None else plan.retraining
     settings: dict[str, Any] = {**world, "retraining": retraining, **({} if device == "cpu" else {"device": device})}
+    settings["even_strata"] = even_strata
     with as_bad_input(ValueError, OSError):
-        path = train_ego(env, algo, steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **settings)
-    data = {"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world}
+        path = train_ego(ids, algo, steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **settings)
+    data = {"ego": str(path), "env_id": ids[0] if len(ids) == 1 else ids, "algo": algo, "steps": steps, "seed": seed}
+    data |= {**world, "even_strata": even_strata}
     if retraining is not None:
         data |= {"retrained": str(retraining.ego), "failures": len(retraining.failures)}
         data["failure_share"] = retraining.share
@@ -89,12 +99,22 @@ def train_ego_command(
     options = [
         f"--{name} {shlex.quote(str(each))}" for name, each in told.items() if each not in (None, USUAL.get(name))
     ]
-    words = " ".join(["rare-envs estimate", env, "--ego", shlex.quote(str(path)), *options])
+    ego = shlex.quote(str(path))
+    asks = ["rare-envs estimate", *ids, "--ego", ego] if len(ids) == 1 else ["rare-envs risk", ego]
+    words = " ".join([*asks, *options])
     return Answer(data, f"Saved {path}. Next: {words}{' --weather' if world['weather'] else ''}")
 
 
+def _read_environments(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the ids of environments, those of `risk` for "all"."""
+    from rare_envs.scenarios.registry import complete_id, env_id_of
+    from rare_envs.study.risk import SCENARIO_SET
+
+    return tuple(map(env_id_of, SCENARIO_SET)) if [*names] == ["all"] else tuple(map(complete_id, names))
+
+
 def _read_plan(
-    runs: list[Path], share: float, trust: bool, env: str | None, algo: str | None, asked: Mapping[str, Any]
+    runs: list[Path], share: float, trust: bool, ids: Sequence[str], algo: str | None, asked: Mapping[str, Any]
 ) -> RetrainingPlan:
     """Return how to train on with the failures of runs."""
     from rare_envs.study.corpus import plan_retraining
@@ -102,8 +122,8 @@ def _read_plan(
     if any(value != getattr(Question, name) for name, value in asked.items()):
         raise BadInput("The world of --from-failures is that of the run: leave --base, --drivers and the like out.")
     plan = plan_retraining(runs, share, trust)
-    for name, given, own in (("ENV", env, plan.env_id), ("--algo", algo, plan.algo)):
-        if given not in (None, own):
+    for name, given, own in (("ENV", " ".join(ids), plan.env_id), ("--algo", algo, plan.algo)):
+        if given not in ("", None, own):
             raise BadInput(f"Expected {name} {own}, that of the run in {str(runs[-1])!r}, got {given!r}; leave it out.")
     return plan
 

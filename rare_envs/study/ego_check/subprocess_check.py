@@ -27,7 +27,7 @@ from agents.saved_ego import find_statistics
 from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
 from rare_envs.plugins import EgoGone, NoAnswer, reason_of
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.simulation.observation import map_kinds
+from rare_envs.simulation.observation import map_kinds, observation_space
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput, Question, as_bad_input
 from rare_envs.study.ego_check import Finding
@@ -187,7 +187,7 @@ def _act(hello: Any, session: int, step: int, rows: int = 3) -> dict[str, Any]:
     """Return a query with blank observations of the space that the server has declared."""
     from agents.remote import protocol
 
-    space = protocol.decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
+    space = protocol.decode_space(hello.get("observation")) or observation_space(vehicles=2)
     parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
     blank = map_kinds(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
     return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}

@@ -16,7 +16,7 @@ ENV = "rare_envs/CarFollowing-v0"
 class Braking:
     """Brakes by what it sees; its actions are single precision."""
 
-    observation_space = spaces.Box(-5.0, 5.0, (7,), np.float32)
+    observation_space = spaces.Box(-5.0, 5.0, (11,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def predict(
@@ -45,7 +45,7 @@ def problem(ego: Any) -> rare_envs.DrivingProblem:
 
 def good_messages() -> list[dict[str, Any]]:
     """Return one request of each type, in an order in which all succeed."""
-    observation = protocol.pack_array(np.zeros((2, 7), np.float32))
+    observation = protocol.pack_array(np.zeros((2, 11), np.float32))
     return [
         {"type": "hello", "protocol": 1, "id": 1},
         {"type": "reset", "id": 2, "session": 5, "batch": 2},

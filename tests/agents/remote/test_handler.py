@@ -107,13 +107,13 @@ def test_observations_of_several_kinds_travel_by_name(serve: Any, connect_ego: A
             return np.stack((observation["near"][:, 0], observation["far"].sum(axis=(1, 2))), axis=1), None
 
     there = connect_ego(serve(Two()).address)
-    assert {name: part.shape for name, part in there.observation_space.items()} == {"near": (7,), "far": (2, 3)}
-    observation = {"near": np.full((2, 7), 0.5, np.float32), "far": np.full((2, 2, 3), 200, np.uint8)}
+    assert {name: part.shape for name, part in there.observation_space.items()} == {"near": (11,), "far": (2, 3)}
+    observation = {"near": np.full((2, 11), 0.5, np.float32), "far": np.full((2, 2, 3), 200, np.uint8)}
     np.testing.assert_array_equal(there.predict(observation)[0], [[0.5, 1200.0], [0.5, 1200.0]])
     handler = RequestHandler(Two())
     for message in good_messages()[:2]:
         handler.handle(b"me", protocol.pack(message))
-    for parts in ({}, [1], {"near": None}, {"near": protocol.pack_array(np.zeros((3, 7)))}):
+    for parts in ({}, [1], {"near": None}, {"near": protocol.pack_array(np.zeros((3, 11)))}):
         bad = {**good_messages()[2], "observation": {"parts": parts}}
         assert protocol.unpack(handler.handle(b"me", protocol.pack(bad)))["type"] == "error"
 

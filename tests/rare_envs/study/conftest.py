@@ -44,7 +44,7 @@ def idle():  # as a policy of HighwayEnv, which has meta-actions
 
 def wrong_space():
     ego = coasting()
-    ego.observation_space = Box(-1.0, 1.0, (99,))
+    ego.observation_space = Box(-1.0, 1.0, (101,))
     return ego
 
 def random_later():  # after two answers that are alike, as the check before a run wants

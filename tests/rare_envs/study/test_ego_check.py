@@ -29,7 +29,7 @@ import time
 import numpy as np
 from gymnasium import spaces
 
-BOX = spaces.Box(-5.0, 5.0, (7,), np.float32)
+BOX = spaces.Box(-5.0, 5.0, (11,), np.float32)
 ACTS = spaces.Box(-1.0, 1.0, (2,), np.float32)
 CALLS = []
 
@@ -81,7 +81,7 @@ good_without_spaces = lambda: made(braking, None, None)
 another_unit = lambda: made(braking, action_space=spaces.Box(-5.0, 5.0, (2,), np.float32))
 another_shape = lambda: made(braking, spaces.Box(-5.0, 5.0, (8,), np.float32))
 lies_about_actions = lambda: made(braking, action_space=spaces.Discrete(5))
-lies_about_observations = acting(lambda seen, _: seen @ np.ones((8, 2)))
+lies_about_observations = acting(lambda seen, _: seen @ np.ones((12, 2)))
 short = acting(lambda _, action: action[:-1])
 nan = acting(lambda _, action: action * np.nan)
 nan_at_zero = acting(lambda seen, action: action / np.abs(seen).max(axis=1)[:, None])

@@ -112,11 +112,19 @@ def test_an_ego_is_trained_on_with_the_failures_of_its_runs(cli: Cli, risky: str
     assert answer.items() >= {**expected, "failure_share": 0.5}.items()
     printed = cli("train-ego", "--from-failures", runs[0], "--out", on, *words[:-1]).stdout.replace("\n", " ")
     assert f"--base {risky} --seed 8" in printed.replace("  ", " ")
-    assert_refused(cli("estimate", "rare_envs/CutIn-v0", "--ego", ego), "(7,)", "(11,)")
     one = ("train-ego", "--from-failures", runs[0], "--out", on)
     assert_refused(cli(*one, "--algo", "ppo"), "Expected --algo a2c", "'ppo'")
     assert_refused(cli("train-ego", "rare_envs/CutIn-v0", *one[1:]), f"Expected ENV {FOLLOWING}")
     assert_refused(cli(*one, "--failure-share", 1), "share of failures above 0 and below 1")
+
+
+def test_an_ego_is_trained_in_all_scenarios_of_risk(cli: Cli, tmp_path: Path) -> None:
+    ego = tmp_path / "ego.zip"
+    words = ("--steps", 16, "--num-envs", 8, "--algo", "a2c", "--horizon", 0.5, "--out", ego)
+    printed = cli("train-ego", "all", *words).stdout
+    assert f"Next: rare-envs risk {ego}" in " ".join(printed.split())
+    answer = json.loads(cli("train-ego", "HardBrake-v0", "CutIn-v1", *words, "--shares", "--json").stdout)
+    assert answer["env_id"] == ["rare_envs/HardBrake-v0", "rare_envs/CutIn-v1"]
 
 
 def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     ((*ESTIMATE, "--also-under", "i24,i24"), ("each once",)),
     ((*ESTIMATE, "--out", "a_file"), ("a_file",)),
     ((*ESTIMATE, "--ego", "corrupt.zip"), ("corrupt.zip",)),
-    ((*ESTIMATE, "--ego", "egos_here:wrong_space"), ("99", "(7,)")),
+    ((*ESTIMATE, "--ego", "egos_here:wrong_space"), ("101", "(11,)")),
     ((*ESTIMATE, "--ego", "egos_here:wrong_shape"), ("(2, 2)",)),
     ((*ESTIMATE, "--ego", "egos_here:raising"), ("division by zero",)),
     ((*ESTIMATE, "--ego", "egos_here:raising", "--on-error", "bound"), ("zero. --on-error bound", "comes before")),
