@@ -137,9 +137,7 @@ class BatchedVecEnv(VecEnv):
     of a batch live in one simulation, so attributes and methods are those of the batch.
     """
 
-    def __init__(
-        self, *batches: VectorEnv[Any, Any, Any], discrete_actions: NDArray[Any] | None = None
-    ) -> None:
+    def __init__(self, *batches: VectorEnv[Any, Any, Any], discrete_actions: NDArray[Any] | None = None) -> None:
         """Wrap batches with equal spaces; continuous actions (K, 2) may be chosen from by index."""
         first = batches[0]
         for batch in batches:
