@@ -39,6 +39,7 @@ from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.fast.choice import CORES, CompilerFails, is_compiled, leave_to_torch, simulate
 from rare_envs.make import refuse_unknown, set_up
+from rare_envs.measures.registry import NearCrash
 from rare_envs.plugins import check_name, reason_of
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
@@ -363,16 +364,35 @@ class DrivingProblem:
         """Yield the episodes of x (n, d) at the horizon by tiles; `failed_rows` takes reasons, None raises them."""
         for first in range(0, len(x), self.tile):
             rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
-            driver, mine = self.driver, dict[int, str]()
-            if failed_rows is not None and isinstance(driver, PolicyDriver):
-                driver = replace(driver, failed_rows=mine)
-            with torch.inference_mode():
-                end = None if self.device.type == "cpu" else self._replay(world, rows)
-                if end is None:
-                    end = rollout(world, driver, rows)
-            if failed_rows is not None:
+            mine = None if failed_rows is None else dict[int, str]()
+            end = self.settle(self._drive(world, rows, mine), rows, mine)
+            if failed_rows is not None and mine is not None:
                 failed_rows.update({first + row: reason for row, reason in mine.items()})
             yield end
+
+    def _drive(self, world: World, rows: Tensor, failed_rows: dict[int, str] | None) -> Episode:
+        """Return the episodes of x (B, d), a tile, at the horizon; `failed_rows` as in `_roll_out`."""
+        driver = self.driver
+        if failed_rows is not None and isinstance(driver, PolicyDriver):
+            driver = replace(driver, failed_rows=failed_rows)
+        with torch.inference_mode():
+            end = None if self.device.type == "cpu" else self._replay(world, rows)
+            return rollout(world, driver, rows) if end is None else end
+
+    def settle(self, end: Episode, rows: Tensor, failed_rows: dict[int, str] | None = None) -> Episode:
+        """Return episodes at the horizon, of x (B, d), with what their measure takes from second rollouts, if any."""
+        measure = end.measure
+        if not isinstance(measure, NearCrash):
+            return end
+        at = measure.find_undecided(end.measure_state)
+        if not len(at):
+            return end
+        mine = None if failed_rows is None else dict[int, str]()
+        ttc = Measurement("ttc", self.world.measurement.collisions)
+        again = self._drive(replace(self.world, rapid=False, measurement=ttc), rows[at.to(rows.device)], mine)
+        if failed_rows is not None and mine is not None:
+            failed_rows.update({int(at[row]): reason for row, reason in mine.items()})
+        return end._replace(measure_state=measure.settle(end.measure_state, at, again.f.to(at.device)))
 
     def _replay(self, world: World, rows: Tensor) -> Episode | None:
         """Return the episodes of x (B, d) on a GPU; None where the CPU has to ask a policy, or to tell how it fails."""

@@ -95,6 +95,7 @@ def find_script(world: World, statistics: bool = False) -> str:
             f"the measure {measurement.measure!r} is": measurement.episode_measure != MEASURES["ttc"],
             "statistics of episodes are": measurement.statistics and not statistics,
             "collisions of other vehicles are": measurement.collisions != "ego",
+            "limits of the ego's manoeuvres are": not world.rapid,
             "parameters of the weather are": world.dim != scenario.size,
         }
     )

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from rare_envs.devices import may_hold, scalars
-from rare_envs.traffic.bodies import Lead, lead_index, lead_of
+from rare_envs.traffic.bodies import Lead, lead_of
 from rare_envs.traffic.road import Road, straight
-from rare_envs.traffic.state import VEHICLE_LENGTH, State, map_leaves, map_tensors
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State, map_leaves, map_tensors
 
 GAP_MIN = 0.01
 """Gaps are floored here [m] so that only a collision, never a narrow escape, comes to 0 or less."""
@@ -52,6 +52,9 @@ class Moment(NamedTuple):
     """The state one tick earlier; None at the start."""
     dt: float = 0.1
     """Tick [s]."""
+    evades: Tensor | None = None
+    """Whether another vehicle makes a rapid evasive manoeuvre, boolean, shape (B,), as the scenario says; None where
+    it says nothing, or the measure does not ask (`EpisodeMeasure.twice`)."""
 
     @classmethod
     def of_two(cls, gap: float, speed: float, lead_speed: float) -> Moment:
@@ -74,12 +77,32 @@ def gap_of(moment: Moment) -> Tensor:
     return moment.lead.gap.clamp(GAP_MIN, GAP_MAX)
 
 
-def acceleration_of_lead(moment: Moment) -> Tensor:
-    """Return the lead's acceleration along the ego's heading over the last tick [m/s^2], 0 without a lead, (B,)."""
-    lead, heading = lead_index(moment.state, moment.road), moment.state.heading
+def acceleration_of(moment: Moment, vehicle: Tensor) -> Tensor:
+    """Return a vehicle's acceleration along the ego's heading over the last tick [m/s^2], 0 for number 0, (B,)."""
+    heading = moment.state.heading
     along = moment.acceleration * torch.cos(heading - heading[:, :1])
-    of_lead = along.gather(1, lead[:, None])[:, 0]
-    return torch.where(lead > 0, of_lead, 0.0)
+    return torch.where(vehicle > 0, along.gather(1, vehicle[:, None])[:, 0], 0.0)
+
+
+class Obstacle(NamedTuple):
+    """The nearest vehicle ahead of the ego whose body overlaps its own across the road: without steering they meet."""
+
+    gap: Tensor
+    """Bumper to bumper along the road [m], in [`GAP_MIN`, `GAP_MAX`], shape (B,)."""
+    closing_speed: Tensor
+    """Ego's speed less its own along the ego's heading [m/s]; 0 where there is none."""
+    vehicle: Tensor
+    """Its number, int64; 0 where there is none."""
+
+
+def find_obstacle(moment: Moment) -> Obstacle:
+    """Return what is in the way of the ego; a lead that only reaches into its lane, or is beside it, is not."""
+    x, y, heading, speed = moment.state[:4]
+    ahead = x[:, 1:] - x[:, :1]
+    met = (ahead >= 0) & ((y[:, 1:] - y[:, :1]).abs() < VEHICLE_WIDTH)
+    way, vehicle = torch.nn.functional.pad(torch.where(met, ahead, torch.inf), (1, 0), value=torch.inf).min(1)
+    closing = speed[:, :1] - speed * torch.cos(heading - heading[:, :1])  # of the ego itself 0
+    return Obstacle((way - VEHICLE_LENGTH).clamp(GAP_MIN, GAP_MAX), closing.gather(1, vehicle[:, None])[:, 0], vehicle)
 
 
 class EpisodeMeasure(ABC):
@@ -111,6 +134,8 @@ class EpisodeMeasure(ABC):
     """Unit of f; empty for a number without one."""
     critical: float | None = None
     """The critical value of a measure whose large values are dangerous; None where small ones are."""
+    twice: bool = False
+    """Whether f takes a second rollout of some episodes, as that of `rare_envs.measures.registry.NearCrash` does."""
 
     @abstractmethod
     def start(self, moment: Moment, ticks: int) -> MeasureState:
@@ -330,7 +355,7 @@ class Record:
         def align(newest: Any, *older: Any) -> Any:
             return torch.stack((*older, newest))[at, row] if isinstance(newest, Tensor) else newest
 
-        state, lead, road, perception, _, dt = map_leaves(align, self.moments[-1], *self.moments[:-1])
+        state, lead, road, perception, _, dt, _ = map_leaves(align, self.moments[-1], *self.moments[:-1])
         return Trace(state, lead, road, perception, self.first + time <= self.last, self.collided, dt)
 
 

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.devices import are_zero, scalars
-from rare_envs.measures.base import GAP_MIN, STILL, Moment, acceleration_of_lead, gap_of
+from rare_envs.measures.base import GAP_MIN, STILL, Moment, acceleration_of, find_obstacle, gap_of
 from rare_envs.sensors.lidar import RANGE_COLUMNS, RATE_COLUMNS, beam_angles, find_vehicles_met
 from rare_envs.traffic.bodies import lead_index
-from rare_envs.traffic.state import STANDARD_GRAVITY
+from rare_envs.traffic.state import STANDARD_GRAVITY, steering_for
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
@@ -112,7 +112,7 @@ def mttc(moment: Moment) -> Tensor:
     positive. As published, nobody stops (Ozbay, Yang, Bartin and Mudigonda, Transportation Research Record 2083, 2008).
     """
     gap, dv = gap_of(moment), moment.lead.closing_speed
-    da = moment.acceleration[:, 0] - acceleration_of_lead(moment)
+    da = moment.acceleration[:, 0] - acceleration_of(moment, lead_index(moment.state, moment.road))
     square = dv.square() + 2.0 * da * gap
     real = square > 0
     denominator = dv + torch.where(real, square, 1.0).sqrt()
@@ -141,10 +141,11 @@ def drac(moment: Moment) -> Tensor:
     """Return the deceleration rate to avoid a crash [m/s^2]: it just reaches the lead's speed when the gap is used up.
 
     closing speed^2 / (2 gap) while closing, else 0 (Almqvist, Hyden and Risser, Transportation Research Record 1318,
-    1991; Archer, "Indicators for traffic safety assessment and prediction", 2005). Critical: 3.4 (AASHTO, 2004).
+    1991; Archer, "Indicators for traffic safety assessment and prediction", 2005). Critical: 3.4 (AASHTO, 2004). It is
+    that of the nearest vehicle ahead whose body overlaps the ego's across: beside it no braking is required.
     """
-    closing = moment.lead.closing_speed.clamp(min=0.0)
-    return (closing.square() / (2.0 * gap_of(moment))).clamp(max=DECELERATION_MAX)
+    gap, closing, _ = find_obstacle(moment)
+    return (closing.clamp(min=0.0).square() / (2.0 * gap)).clamp(max=DECELERATION_MAX)
 
 
 def required_deceleration(moment: Moment) -> Tensor:
@@ -153,11 +154,11 @@ def required_deceleration(moment: Moment) -> Tensor:
     With b the deceleration of the lead over the last tick (0 where it speeds up), v the ego's speed, w the lead's and
     dv = v - w: b + dv^2 / (2 gap) where the speeds become equal while the lead moves (Jansson, "Collision avoidance
     theory with application to automotive collision mitigation", 2005); v^2 / (2 (gap + w^2 / (2 b))) where the lead
-    stops first, which it does if 2 gap / dv > w / b or dv <= 0.
+    stops first, which it does if 2 gap / dv > w / b or dv <= 0. The lead is that of `drac`: bodies overlap across.
     """
-    gap, dv, speed = gap_of(moment), moment.lead.closing_speed, moment.state.speed[:, 0]
+    (gap, dv, lead), speed = find_obstacle(moment), moment.state.speed[:, 0]
     lead_speed = (speed - dv).clamp(min=0.0)
-    braking = (-acceleration_of_lead(moment)).clamp(min=0.0)
+    braking = (-acceleration_of(moment, lead)).clamp(min=0.0)
     rolling = braking + dv.clamp(min=0.0).square() / (2.0 * gap)
     # the ways are compared crosswise, without a division by what may be 0
     stops_first = (braking > 0) & ((dv <= 0) | (2.0 * gap * braking > lead_speed * dv))
@@ -167,7 +168,7 @@ def required_deceleration(moment: Moment) -> Tensor:
 
 
 def evasive_manoeuvre(moment: Moment) -> Tensor:
-    """Return how rapid the ego's evasive manoeuvre is, without unit, shape (B,): 1 and more makes a near-crash.
+    """Return how rapid the ego's manoeuvre is, without unit, shape (B,): from 1 on it is a rapid one, needed or not.
 
     The greater of its braking over 0.5 g and its lateral acceleration, beyond that of the road's curve, over 0.4 g
     (VTTI, "Researcher dictionary for video reduction data" 1.3, 2012, variable 5; Dingus et al., DOT HS 810 593, 2006).
@@ -182,6 +183,15 @@ def evasive_manoeuvre(moment: Moment) -> Tensor:
     return rapid.clamp(0.0, DECELERATION_MAX / RAPID_BRAKING)
 
 
+def avoid_rapid(speed: Tensor, acceleration: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
+    """Return acceleration [m/s^2] and steering angle [rad] without what `evasive_manoeuvre` calls rapid, (B,) each.
+
+    Braking is limited to 0.5 g, lateral acceleration to 0.4 g, in a bend with that of the bend.
+    """
+    most = steering_for(RAPID_LATERAL / speed.clamp(min=STILL), speed)
+    return acceleration.clamp(min=-RAPID_BRAKING), torch.minimum(torch.maximum(steering, -most), most)
+
+
 def btn(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
     """Return the brake threat number: the required deceleration over what the brakes can do [m/s^2] (Jansson, 2005)."""
     return required_deceleration(moment) / brakes
@@ -191,6 +201,7 @@ def ttb(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
     """Return the time to brake: how long the ego can wait until it must brake fully for a lead that keeps its speed.
 
     gap / closing speed - closing speed / (2 brakes). Negative past the point of no return: by how much it is too late.
+    The lead is that of `drac`: bodies overlap across.
 
     Args:
         moment: Of B scenarios.
@@ -208,8 +219,9 @@ def ttb(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
         >>> ttb(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()  # 25 / 10 - 10 / (2 5)
         1.5
     """
-    closing = moment.lead.closing_speed.clamp(min=STILL)
-    return (gap_of(moment) / closing - closing / (2.0 * brakes)).clamp(-0.99 * TTC_MAX, TTC_MAX)
+    gap, closing, _ = find_obstacle(moment)
+    closing = closing.clamp(min=STILL)
+    return (gap / closing - closing / (2.0 * brakes)).clamp(-0.99 * TTC_MAX, TTC_MAX)
 
 
 TTC_CRITICAL = 3.0

@@ -54,6 +54,60 @@ def _to_vehicles_and_edge(of: Callable[[Moment], Tensor]) -> MeasureTerms:
     return MeasureTerms(of, plane.find_vehicle_or_edge, plane.name_edge_terms)
 
 
+class NearCrashState(NamedTuple):
+    """State of `NearCrash` in B episodes."""
+
+    ttc: Tensor
+    """f of `ttc`: of the episode, or of its second rollout where there was one, shape (B,)."""
+    rapid: Tensor
+    """Greatest `evasive_manoeuvre`."""
+    evaded: Tensor
+    """Whether another vehicle had to evade, boolean."""
+    collided: Tensor
+    """Boolean."""
+
+
+class NearCrash(EpisodeMeasure):
+    """The least time to collision [s] of the same episode without rapid manoeuvres: braking over 0.5 g, 0.4 g across.
+
+    "Any circumstance that requires a rapid, evasive maneuver by the subject vehicle, or any other vehicle ... to avoid
+    a crash" (VTTI, "Researcher dictionary for video reduction data" 1.3, 2012, variable 5). Required is what the ego
+    does if the same ego with the same noise in the same scenario, its actions limited by `avoid_rapid`, collides: f is
+    -1. Episodes without a rapid manoeuvre are such ones by themselves; others are driven a second time, by
+    `DrivingProblem`. A single rollout, as a step of an environment, gives their own time to collision, which is above
+    f. Where another vehicle had to evade (`Scenario.evades`) f is 0 at most; -100 in a collision.
+    """
+
+    unit = "s"
+    twice = True
+    collision = -line.DECELERATION_MAX
+    """f of an episode with a collision."""
+
+    def start(self, moment: Moment, ticks: int) -> NearCrashState:
+        """Return the state after the first moment."""
+        ttc, nobody = line.ttc(moment), torch.zeros_like(moment.lead.gap, dtype=torch.bool)
+        return NearCrashState(ttc, torch.zeros_like(ttc), nobody if moment.evades is None else moment.evades, nobody)
+
+    def update(self, state: NearCrashState, moment: Moment, before: Tensor, now: Tensor) -> NearCrashState:
+        """Return the state after one more moment."""
+        evaded = state.evaded if moment.evades is None else state.evaded | (moment.evades & ~before)
+        least = torch.minimum(state.ttc, line.ttc(moment))
+        return NearCrashState(least, torch.maximum(state.rapid, line.evasive_manoeuvre(moment)), evaded, now)
+
+    def f(self, state: NearCrashState) -> Tensor:
+        """Return the measure, shape (B,)."""
+        f = torch.where(state.evaded, state.ttc.clamp(max=0.0), state.ttc)
+        return torch.where(state.collided, self.collision, f)
+
+    def find_undecided(self, state: NearCrashState) -> Tensor:
+        """Return the episodes, (K,) of B, that have to be driven once more: with a rapid manoeuvre that sufficed."""
+        return ((state.rapid >= 1.0) & ~state.evaded & ~state.collided).nonzero()[:, 0]
+
+    def settle(self, state: NearCrashState, rows: Tensor, f: Tensor) -> NearCrashState:
+        """Return the state with f (K,) of `ttc` in the second rollouts of the episodes `rows` (K,)."""
+        return state._replace(ttc=state.ttc.index_copy(0, rows, f))
+
+
 _SOON: dict[str, Any] = {"cuts": (plane.EARLY_SHARE,), "unattained": plane.CLEARANCE_MAX}
 CLEARANCE = Measure(plane.clearance, unit="m", terms=MeasureTerms(plane.distances, **_SOON), collisions_only=True)
 """Distance to the nearest vehicle. A collision belongs to the vehicle that was hit, off the road to the nearest."""
@@ -74,7 +128,8 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
             line.required_deceleration, collision=_BRAKING, critical=line.MAX_BRAKING, unit="m/s^2"
         ),
         "btn": Measure(line.btn, collision=_BRAKING, critical=1.0, unit=""),
-        "near_crash": Measure(line.evasive_manoeuvre, collision=_BRAKING, critical=1.0, unit=""),
+        "near_crash": NearCrash(),
+        "evasive_manoeuvre": Measure(line.evasive_manoeuvre, collision=_BRAKING, critical=1.0, unit=""),
         "ttb": Measure(line.ttb, collision=-line.TTC_MAX),
         "pet": TraceMeasure(plane.pet, unit="s"),
         "rss_longitudinal": Measure(plane.rss_longitudinal, collision=_MARGIN, unit="m"),
@@ -135,6 +190,8 @@ class Combined(EpisodeMeasure):
     """f of an episode with a collision; None for the function of the parts."""
 
     def __post_init__(self) -> None:
+        if any(part.twice for part in self.parts):
+            raise ValueError("near_crash takes two rollouts and cannot be combined with other measures.")
         units = {part.unit for part in self.parts}
         object.__setattr__(self, "sees", any(part.sees for part in self.parts))
         object.__setattr__(self, "records", any(part.records for part in self.parts))

@@ -19,6 +19,7 @@ from rare_envs.devices import fixed_draws
 from rare_envs.distributions.product import NoiseDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import EpisodeMeasure, Moment
+from rare_envs.measures.longitudinal import avoid_rapid
 from rare_envs.measures.registry import find_measure
 from rare_envs.scenarios.base import Others, Scenario, drive_points
 from rare_envs.sensors.camera import WEATHER, Camera, CameraContext, clear_day, read_weather
@@ -35,7 +36,7 @@ from rare_envs.simulation.background import (
 from rare_envs.simulation.episode import LEARNED_TICK, Episode, EpisodeStatistics
 from rare_envs.simulation.observation import observation_space
 from rare_envs.traffic.bodies import lead_of, overlaps
-from rare_envs.traffic.road import WorldPose
+from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import State, bicycle
 
 
@@ -195,6 +196,8 @@ class World:
     """Time; without a horizon, that of the scenario."""
     noise: bool | str = True
     """Noise of drivers and camera: True, part of x; "fixed", one sequence for all x; False, none."""
+    rapid: bool = True
+    """Whether the ego's actions may be rapid manoeuvres; if not, `avoid_rapid` limits them."""
 
     def __post_init__(self) -> None:
         if self.clock.horizon is None:
@@ -287,7 +290,7 @@ class World:
     ) -> Episode:
         """Begin B episodes of the vehicle in the ego's place from a state, with lidar features (B, N, 51) or None."""
         road, measure = self.scenario.road, self.measurement.episode_measure
-        moment = Moment(state, lead_of(state, road), road, perception, None, self.clock.dt)
+        moment = self._moment(state, road, perception, None)
         measure_state = measure.start(moment, self.clock.ticks)
         statistics = None
         if self.measurement.statistics:
@@ -308,7 +311,7 @@ class World:
 
     def update(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
         """Return episodes a tick later: new state, lidar features and hits of the vehicle in the ego's place, (B,)."""
-        moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.clock.dt)
+        moment = self._moment(state, episode.road, perception, episode.state)
         collided = episode.collided | hit
         measure_state = episode.measure.update(episode.measure_state, moment, episode.collided, collided)
         statistics, camera_context = episode.statistics, episode.camera_context
@@ -360,6 +363,8 @@ class World:
         old, dt, road, background_state = episode.state, self.clock.dt, episode.road, episode.background_state
         ego, (acceleration, steering) = old.vehicles[0], (action if commanded is None else action[:, 0]).unbind(1)
         curvature = None if road.reference_line is None else road.curvature(ego.x)
+        if not self.rapid:
+            acceleration, steering = avoid_rapid(ego.speed, acceleration, steering)
         moved = bicycle(*ego, acceleration, steering, dt, curvature)
         driver_actions = None
         if self.background is None or background_state is None:
@@ -380,6 +385,12 @@ class World:
             hit = hit | overlaps(state, road, "others").any(dim=1)
         episode = episode._replace(background_state=background_state, overridden=overridden)
         return self.update(episode, state, perception, hit)
+
+    def _moment(self, state: State, road: Road, perception: Tensor | None, before: State | None) -> Moment:
+        """Return the moment of a state, with others' evasions if the measure counts them."""
+        evades = getattr(self.scenario, "evades", None) if self.measurement.episode_measure.twice else None
+        evading = None if evades is None else evades(state)
+        return Moment(state, lead_of(state, road), road, perception, before, self.clock.dt, evading)
 
     def _least_ttc(self, measure_state: Tensor) -> Tensor | None:
         """Return the least time to collision, where that is the measure."""

@@ -137,10 +137,12 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
     episodes: list[Episode] = []
     # single precision, as in `DrivingProblem.evaluate`, so that f comes out the same
     world, driver = problem.on_cpu()
-    for episode in drive(world.with_statistics(), driver, torch.from_numpy(x).float()[None]):
+    rows = torch.from_numpy(x).float()[None]
+    for episode in drive(world.with_statistics(), driver, rows):
         episodes.append(episode)
         if bool(episode.collided):
             break
+    episodes[-1] = problem.settle(episodes[-1], rows.to(problem.device))
     return Drive(problem, tuple(episodes))
 
 

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures import MEASURES, Measure, Moment, ttb, ttc
-from rare_envs.measures.base import acceleration_of_lead
+from rare_envs.measures.base import acceleration_of, find_obstacle
 from rare_envs.measures.longitudinal import (
     DECELERATION_MAX,
     TTC_MAX,
+    avoid_rapid,
     btn,
     drac,
     evasive_manoeuvre,
@@ -32,7 +33,7 @@ from rare_envs.measures.two_dimensional import (
     rss_margin,
     ttc_2d,
 )
-from rare_envs.traffic.bodies import Lead, lead_of
+from rare_envs.traffic.bodies import Lead, lead_index, lead_of
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import F64, TIME, drives, following, moment, path
@@ -193,9 +194,42 @@ def test_the_acceleration_of_the_lead_is_that_of_the_vehicle_whose_gap_is_measur
     places = ((60.0, 0.0), (30.0, 0.5), (10.0, 4.0), (-9.0, 0.0))
     far, near, beside, behind = ((x, y, math.pi / 3, 9.0) for x, y in places)
     traffic = moment(EGO, far, near, beside, behind, accelerations=(1.0, -2.0, -3.0, -4.0, -5.0))
-    torch.testing.assert_close(acceleration_of_lead(traffic), torch.tensor([-1.5], dtype=F64))  # half, at 60 degrees
+    near = lead_index(traffic.state, traffic.road)
+    assert find_obstacle(traffic).vehicle.tolist() == near.tolist() == [2]
+    torch.testing.assert_close(acceleration_of(traffic, near), torch.tensor([-1.5], dtype=F64))  # half, at 60 degrees
     nobody = moment(EGO, beside, behind, accelerations=(1.0, -4.0, -5.0))
-    assert acceleration_of_lead(nobody).tolist() == [0.0]
+    assert find_obstacle(nobody).vehicle.tolist() == lead_index(nobody.state, nobody.road).tolist() == [0]
+    assert acceleration_of(nobody, find_obstacle(nobody).vehicle).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("measure", "beside", "overlapping"),
+    [
+        (drac, 0.0, 50.0),  # 10^2 / (2 x 1 m)
+        (required_deceleration, 0.0, 50.0),
+        (btn, 0.0, 10.0),
+        (ttb, TTC_MAX, 0.1 - 1.0),  # 0.1 s less 10 / (2 x 5)
+    ],
+)
+def test_what_is_beside_the_ego_is_not_in_its_way(measure: object, beside: float, overlapping: float) -> None:
+    """A body 2 m wide that reaches into the ego's lane, 1 m ahead and 10 m/s slower, 5 cm clear of the ego or not."""
+    assert callable(measure)
+    for across, value in ((2.05, beside), (1.95, overlapping)):
+        now = moment(EGO, (6.0, across, 0.0, 10.0))
+        assert lead_index(now.state, now.road).tolist() == [1]  # times to collision and headways count it as a lead
+        assert measure(now).item() == pytest.approx(value)
+    behind = moment(EGO, (6.0, 2.05, 0.0, 10.0), (30.0, 0.0, 0.0, 10.0))  # whoever is in the way further ahead counts
+    assert drac(behind).item() == pytest.approx(10.0**2 / (2 * 25.0))
+
+
+def test_actions_are_limited_to_what_is_not_rapid() -> None:
+    speed, asked = torch.tensor([20.0, 20.0, 0.0, 5.0]), torch.tensor([-7.0, 2.0, -6.0, -3.0])
+    turned = torch.tensor([0.3, -0.3, 0.3, 0.02])
+    acceleration, steering = avoid_rapid(speed, asked, turned)
+    torch.testing.assert_close(acceleration, torch.tensor([-0.5 * 9.80665, 2.0, -0.5 * 9.80665, -3.0]))
+    across = speed.square() * torch.sin(torch.atan(torch.tan(steering) / 2)) / 2.5  # v x yaw rate
+    torch.testing.assert_close(across[:2], 0.4 * 9.80665 * torch.tensor([1.0, -1.0]))
+    torch.testing.assert_close(steering[2:], turned[2:])
 
 
 def test_margin_has_an_order_where_times_are_capped() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 
 import gymnasium as gym
@@ -11,9 +12,12 @@ import torch
 from torch import Tensor
 
 import rare_envs
+from rare_envs.control.idm import IDM
 from rare_envs.measures import Measure, Moment, Trace, TraceMeasure, minimum, stl, ttc, weighted, with_collision
 from rare_envs.measures.two_dimensional import PET_MAX, pet
-from rare_envs.simulation.world import drive
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.simulation.world import Measurement, World, drive, rollout
+from rare_envs.study.replay import drive_again
 from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
@@ -36,13 +40,95 @@ def test_a_collision_is_worse_than_anything_else(name: str, collision: float) ->
     assert values[0] < values[1]
 
 
-def test_near_crashes_count_collisions_apart() -> None:
+def test_rapid_manoeuvres_count_collisions_apart() -> None:
     """IDM brakes by 5 m/s^2 at most, which is more than 0.5 g; with a hit it is too late."""
-    around = rare_envs.DrivingProblem(FOLLOWING, measure="near_crash")
+    around = rare_envs.DrivingProblem(FOLLOWING, measure="evasive_manoeuvre")
     f = around.evaluate(np.array([(30.0, 10.0, 5.0), (30.0, 10.0, 60.0), (20.0, 20.0, 100.0)]))
     assert f[0] == -100.0
     assert f[1] == pytest.approx(1.0 - 5.0 / (0.5 * 9.80665), abs=1e-4)
     assert 0.99 < f[2] < 1.0
+
+
+class Braking:
+    """An ego that brakes from the first moment on."""
+
+    def __init__(self, deceleration: float) -> None:
+        self.deceleration = deceleration
+
+    def act(self, episode, memory):
+        return torch.tensor([-self.deceleration, 0.0]).expand(len(episode.collided), 2), memory
+
+
+def test_a_near_crash_is_what_half_a_g_does_not_avoid() -> None:
+    """From 20 m/s behind 10 m/s: v^2 / (2 b) = 6.25 m at 8 m/s^2, 10.2 m at 0.5 g, half a tick's way more at most."""
+    half_g = 0.5 * 9.80665
+    gaps = {"contact": 6.2, "near": 8.5, "safe": 10.8}
+    assert 100 / 16.0 + 0.5 < gaps["near"] < 100 / (2 * half_g) < gaps["safe"] - 0.5
+    x = np.array([(20.0, 10.0, gap) for gap in gaps.values()])
+    f = rare_envs.DrivingProblem(FOLLOWING, Braking(8.0), "near_crash").evaluate(x)
+    assert f[:2].tolist() == [-100.0, -1.0]
+    gentle = rare_envs.DrivingProblem(FOLLOWING, Braking(half_g), "ttc").evaluate(x)
+    assert gentle[:2].tolist() == [-1.0, -1.0]
+    assert f[2] == gentle[2] > 0.0
+    own = rare_envs.DrivingProblem(FOLLOWING, Braking(4.0), "near_crash").evaluate(x)
+    assert own[2] == -100.0  # nothing rapid about it, and too late
+
+
+def test_near_crashes_are_those_of_a_second_rollout_with_the_same_noise() -> None:
+    around = rare_envs.DrivingProblem("rare_envs/HardBrake-v0", "human", "near_crash")
+    x = around.base.sample(3000, np.random.default_rng(5))
+    f = around.evaluate(x)
+    rows = torch.from_numpy(x).float()
+    with torch.inference_mode():
+        for rapid in (True, False):
+            world = replace(around.world, rapid=rapid, measurement=Measurement("ttc"))
+            ttc_of = rollout(world, around.driver, rows).f.double().numpy()
+            if rapid:
+                own = ttc_of
+    letter = rare_envs.DrivingProblem("rare_envs/HardBrake-v0", "human", "evasive_manoeuvre").evaluate(x)
+    contact, rapid = letter == -100.0, letter <= 0.0
+    np.testing.assert_array_equal(f[contact], -100.0)
+    np.testing.assert_array_equal(f[~rapid], own[~rapid])
+    np.testing.assert_array_equal(f[rapid & ~contact], ttc_of[rapid & ~contact])
+    assert (rapid & ~contact).sum() > 100 < (~rapid).sum()
+    np.testing.assert_array_equal(around.terms(x[:50]).f, f[:50])
+    np.testing.assert_array_equal(around.attempt(x[:50])[0], f[:50])
+    worst = int(f[rapid & ~contact].argmin())
+    assert drive_again(around, x[rapid & ~contact][worst]).f == f[rapid & ~contact][worst]
+
+
+def test_whoever_has_to_evade_the_ego_makes_a_near_crash() -> None:
+    """A scenario that says so where its lead is slower than 12 m/s; the ego keeps away from it by itself."""
+    scenario = replace(find_scenario(FOLLOWING), name="evading")
+    object.__setattr__(scenario, "evades", lambda state: state.speed[:, 1] < 12.0)
+    world = World(scenario, measurement=Measurement("near_crash"))
+    x = torch.tensor([(20.0, 10.0, 100.0), (20.0, 15.0, 100.0), (30.0, 5.0, 5.0)])
+    f = rollout(world, IDM(), x).f
+    assert f[:1].tolist() + f[2:].tolist() == [0.0, -100.0]
+    assert f[1] > 0.0
+
+
+def test_a_measure_of_two_rollouts_is_not_combined() -> None:
+    with pytest.raises(ValueError, match="two rollouts"):
+        minimum("ttc", "near_crash")
+
+
+class FailsInTheSecond:
+    """A policy that brakes by 5 m/s^2, and fails at a speed of row 1 that half a tick of braking by 0.5 g leads to."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        speed = 30.0 * observation[:, 0]
+        if ((speed > 20.0 - 5 * 0.4904) & (speed < 20.0 - 5 * 0.4902)).any():
+            raise RuntimeError("no idea")
+        return np.repeat(np.float32([[-1.0, 0.0]]), len(observation), axis=0), state
+
+
+def test_failures_of_a_policy_in_second_rollouts_are_those_of_their_rows() -> None:
+    around = rare_envs.DrivingProblem(FOLLOWING, FailsInTheSecond(), "near_crash", horizon=1.0)
+    x = np.array([(45.0, 0.0, 1.0), (21.0, 19.0, 100.0), (20.0, 19.0, 100.0), (22.0, 19.0, 100.0)])
+    f, reasons = around.attempt(x)
+    assert list(reasons) == [2] and "no idea" in reasons[2]
+    assert np.isnan(f).tolist() == [False, False, True, False]
 
 
 def test_margin_goes_on_past_contact() -> None:
@@ -55,7 +141,7 @@ def test_margin_goes_on_past_contact() -> None:
 RTAMT = "rtamt runs on Python 3.11 or older"
 needs_rtamt = pytest.mark.skipif(find_spec("rtamt") is None, reason=RTAMT)
 SAMPLE: dict[str, Callable[[], object]] = {
-    **{name: (lambda name=name: name) for name in ("drac", "tet", "pet", "margin")},
+    **{name: (lambda name=name: name) for name in ("drac", "tet", "pet", "margin", "near_crash")},
     "minimum": lambda: minimum("ttc", "pet", with_collision("drac", -3.0)),
     "stl": lambda: stl("always (gap > 2 or ttc > 1)"),
     "function": lambda: lambda moment: moment.lead.gap.clamp(max=99.0),
