@@ -26,8 +26,6 @@ RULE_BASED = "idm"
 """The Intelligent Driver Model with lane keeping."""
 LANE_CHANGING = "idm+mobil"
 """The same with lane changes by MOBIL; a driver of the traffic."""
-HUMAN = "human"
-"""An attentive human driver by a published model."""
 VISION, SHIPPED_EGOS, SHIPPED_DRIVERS = "vision", ("imitation",), ("mgail", "gail")
 """Shipped networks: the ego with a camera, drivers that were trained to be egos, drivers of the traffic."""
 SHIPPED, SUFFIX = Path(__file__).parent / "data", ".safetensors"

@@ -14,20 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import files
-from agents.files import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, SUFFIX, VISION
+from agents.files import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, SUFFIX, VISION
 from agents.imperfect_stack import NoisyEgo, Stack
 from agents.learned.driver import LearnedDriver, LearnedEgo, RuleDriver, read_driver
 from agents.learned.networks import HUMAN_NOISE
 from agents.saved_ego import HUB_PREFIX, find_hub_model, load_saved_ego
 from agents.vision import load_vision
-from rare_envs.control.human_driver import HumanDriverModel
-from rare_envs.control.idm import IDM
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.human import HumanEgo
-from rare_envs.egos.needs import wrap_callable
+from rare_envs.egos.needs import RULE_BASED_EGOS, wrap_callable
 from rare_envs.plugins import EgoGone, did_you_mean, import_object, is_policy, one_line, refuse_ego
 
-EGO_NAMES = (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
+EGO_NAMES = (*RULE_BASED_EGOS, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
 EXPECTED_EGO: Final = (
     f"{', '.join(map(repr, EGO_NAMES))}, a path to a {SUFFIX} or "
     "Stable-Baselines3 .zip, hf:USER/REPOSITORY, "
@@ -77,8 +75,9 @@ def load_ego(
     """Load an ego by its name, file, address or function.
 
     Args:
-        spec: "idm"; "human", an attentive human driver; either with other parameters as "idm?time_headway=2&exponent=2"
-            (fields of `rare_envs.IDM` and `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
+        spec: "idm"; "human", an attentive human driver, or "human:no-headway-rule", who looks away for as long as it
+            likes; all with other parameters as "idm?time_headway=2&exponent=2" (fields of `rare_envs.IDM` and
+            `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
             ego with lidar; "vision", PilotNet on the front camera; "mgail" or "gail", drivers of the traffic,
             by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors` with one of these
             kinds, to a `.zip` saved by Stable-Baselines3, or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form);
@@ -94,8 +93,8 @@ def load_ego(
             `<name>_vecnormalize.pkl` or `vecnormalize.pkl`.
 
     Returns:
-        "idm" and "human" as they stand, with settings an `IDM` or a `HumanEgo`; a `LearnedEgo`, else an object with
-        `predict`. A `.zip` gives a `SavedEgo`, whose `observation_space` and `action_space` are those of the policy.
+        Names of rule-based egos as they stand, with settings an `IDM` or a `HumanEgo`; a `LearnedEgo`, else an object
+        with `predict`. A `.zip` gives a `SavedEgo`, whose `observation_space` and `action_space` are the policy's.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -158,9 +157,10 @@ def _load_rule_based(text: str, *_: Any) -> Any:
     if not mark:
         return text
     try:
-        if name == HUMAN:
-            return HumanEgo(HumanDriverModel(**_read_settings(HumanDriverModel, query)))
-        return IDM(**_read_settings(IDM, query))
+        ego = RULE_BASED_EGOS[name]
+        if isinstance(ego, HumanEgo):
+            return HumanEgo(replace(ego.model, **_read_settings(type(ego.model), query)))
+        return replace(ego, **_read_settings(type(ego), query))
     except ValueError as error:
         raise ValueError(f"The ego {text!r}: {error}") from None
 
@@ -216,7 +216,7 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
     "hub": (lambda spec: spec.startswith(HUB_PREFIX), lambda text, *how: load_saved_ego(find_hub_model(text), *how)),
     "remote": (lambda spec: spec.startswith(("tcp://", "ipc://")), _load_elsewhere),
     "url": (lambda spec: "://" in spec, _refuse_url),
-    "rule": (lambda spec: spec.partition("?")[0] in (RULE_BASED, HUMAN), _load_rule_based),
+    "rule": (lambda spec: spec.partition("?")[0] in RULE_BASED_EGOS, _load_rule_based),
     "vision": (
         lambda spec: spec == VISION or (spec.endswith(SUFFIX) and files.holds_vision(spec)),
         lambda text, *_: load_vision(text),

@@ -1,7 +1,8 @@
 """The human driver model of Treiber, Kesting and Helbing, with published limits of perception and braking; and glances.
 
-Reaction time, errors of estimation and anticipation around the Intelligent Driver Model. Everything here is a formula
-of what the driver has seen; `rare_envs.egos.human` adds the memory that makes an ego of it.
+Reaction time, errors of estimation and anticipation around the improved IDM with the constant-acceleration heuristic,
+when eyes leave the road and what brings them back, and steering away from who comes in. Everything here is a formula of
+what the driver has seen; `rare_envs.egos.human` adds the memory that makes an ego of it.
 
 Glances away from the road: 4,604 of 1,791 baseline epochs of SHRP 2, coded from video in steps of 0.1 s, the longest
 6.7 s. Their table is not published. It is found from the probabilities of the overshot of Imberg et al. (2022,
@@ -11,12 +12,15 @@ times the difference of neighbouring probabilities. All counts above 2 s come ou
 
 References:
     Treiber, Kesting and Helbing, "Delays, inaccuracies and anticipation in microscopic traffic models", Physica A 360,
-    2006; Treiber and Kesting, "Traffic Flow Dynamics", Springer, 2013, chapter 12; Bargman et al., 2024.
+    2006; Treiber and Kesting, "Traffic Flow Dynamics", Springer, 2013, chapter 12; Kesting, Treiber and Helbing, 2010
+    (see `rare_envs.control.idm`); Bargman et al., 2024; Pekkanen et al., "Task-difficulty homeostasis in car following
+    models", PLoS ONE e0169704, 2017.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -25,11 +29,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.control.idm import IDM
+from rare_envs.control.idm import COOLNESS, IDM, MAX_HEADING_COMMAND, improved_acceleration
 from rare_envs.devices import constant
 from rare_envs.traffic.bodies import Lead
-from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import NEAR_ZERO, STANDARD_GRAVITY, VEHICLE_LENGTH, State
+from rare_envs.traffic.state import MAX_SLIP_SINE, NEAR_ZERO, STANDARD_GRAVITY, VEHICLE_LENGTH, State
 
 GLANCE_CDF: Final = (
     (0.05, 0.0),
@@ -62,10 +65,6 @@ MEAN_GLANCE: Final = sum((d1 + d0) / 2 * (p1 - p0) for (d0, p0), (d1, p1) in pai
 """Mean duration of a glance away from the road [s], 0.866."""
 MEAN_ON_ROAD: Final = MEAN_GLANCE * (1.0 - OFF_ROAD_SHARE) / OFF_ROAD_SHARE
 """Mean time between two such glances [s], 4.3: what gives the share."""
-MOST_URGENT_GLANCE: Final = 0.2
-"""No glance is begun where the lead comes nearer by more than this share of its distance in a second [1/s], a time to
-collision of 5 s: that drivers then keep their eyes on the road is an assumption of the crash causation model of Bargman
-et al. (2024), after Victor et al. ("Analysis of naturalistic driving study data: safer glances", SHRP 2, 2015)."""
 START_DRAWS: Final = 2
 """Draws of how an episode begins: whether with the eyes off the road, and for how long still."""
 
@@ -140,71 +139,162 @@ ATTENTIVE_IDM: Final = IDM(
 """The IDM of motorways: Treiber and Kesting (2013), table 11.2, its values as commonly quoted."""
 
 
-class Percept(NamedTuple):
-    """What a driver knows of V other vehicles at a moment, in B scenarios; shape (B, V) each."""
-
-    distance: Tensor
-    """From centre to centre along the road [m], positive ahead."""
-    speed: Tensor
-    """Of the other vehicle along the driver's heading [m/s]."""
-    noticed: Tensor
-    """Whether the driver takes it for one that it follows, boolean."""
+LONGEST_REACTION = 0.6
+"""Longest reaction time [s] at which this model of braking was held against people."""
 
 
 @dataclass(frozen=True)
 class HumanDriverModel:
-    """Parameters of an attentive human driver; each is published, none is fitted.
+    """Parameters of an attentive human driver, each with its source; none is fitted, and what is assumed says so.
 
     Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
+
+    Raises:
+        ValueError: A parameter is negative or no number.
+
+    Warns:
+        UserWarning: The reaction time is above 0.6 s.
     """
 
     idm: IDM = ATTENTIVE_IDM
-    """How the driver wants to drive."""
+    """How the driver wants to drive: parameters of `rare_envs.control.idm.improved_acceleration`."""
+    coolness: float = COOLNESS
+    """Weight of the constant-acceleration heuristic while no braking of the lead is seen: Kesting, Treiber and Helbing
+    (2010)."""
+    brake_light: float = 0.5
+    """Deceleration of the lead that is seen as braking [m/s^2], assumed. Behind it the driver follows the improved IDM
+    alone, which is assumed too: the heuristic aims at stopping with no gap left."""
     reaction_time: float = 0.6
-    """T' [s]: Treiber and Kesting (2013), table of the human driver model (page 216)."""
+    """T' [s]: Treiber and Kesting (2013), table of the human driver model (page 216). Leave it: with 1 s and this
+    model of braking drivers touch braking leads 100 to 300 times as often (measured). People who react late brake
+    otherwise, by what they see then; a longer time needs another model of braking."""
     gap_error: float = 0.1
     """V_s, standard deviation of the logarithm of the estimated gap: the same table."""
     approach_error: float = 0.01
     """sigma_r [1/s], standard deviation of the error of the speed difference over the gap: the same table."""
     error_correlation: float = 20.0
     """Persistence of the errors of estimation [s]: the same table."""
-    leaders: int = 5
-    """Largest number of vehicles ahead to which it responds: the same table."""
     wandering: float = 0.375
-    """A vehicle of the next lane is noticed when its centre is off its lane's centre by more than this, towards the
-    driver [m]: UN Regulation 157, its model of a competent and careful human driver."""
+    """A vehicle of the next lane is noticed when its centre is off its lane's centre, or off where it began if that was
+    further away, by more than this, towards the driver [m]: UN Regulation 157, its model of a competent and careful
+    human driver."""
     noticing_time: float = 0.4
     """... and for as long as this [s]: the same ("risk evaluation")."""
+    notice_indicator: bool = True
+    """Whether a vehicle that signals is noticed at once: assumed, a neighbour who signals is expected to come."""
     jerk: float = 12.65
-    """Fastest build-up of braking [m/s^3]: the same, 0.774 g within 0.6 s."""
+    """Fastest build-up of braking [m/s^3]: Regulation 157, 0.774 g within 0.6 s."""
     glances: bool = True
     """Whether it looks away from the road now and then, see `rare_envs.control.human_driver`."""
+    glance_ttc: float = 5.0
+    """No glance is begun at a shorter time to collision [s]: an assumption of the crash causation model of Bargman et
+    al. (2024), after Victor et al. ("Analysis of naturalistic driving study data: safer glances", SHRP 2, 2015)."""
+    glance_looming: float = 0.003
+    """No glance is begun while the lead can be seen to come nearer, at an expansion rate above this [rad/s]: Hoffmann
+    and Mortimer ("Drivers' estimates of time to collision", Accident Analysis and Prevention 28, 1996). Glances do
+    begin at closing speeds near zero ("Driver eye glance behavior during car following: timing matters", 2015)."""
+    glance_eccentricity: float = 30.0
+    """Angle between a glance and the road [deg], by which `seen_expansion_rate` says when looming breaks it off. Beyond
+    90 degrees none is broken off. In-car displays are at 20 to 40 degrees, this is the middle of that, assumed for
+    every glance."""
+    headway_rule: bool = True
+    """Whether a glance is no longer than the headway (gap over own speed) at its beginning less the reaction time.
+    That self-paced occlusion grows one to one with headway is Pekkanen et al.'s (2017, in a simulator), that it is
+    shorter by the reaction time is assumed. "human:no-headway-rule" is without; people are between."""
+    evasive_share: float = 0.48
+    """Share of drivers who steer away from whom comes in beside them: 66 of 137 cut-in near-crashes and crashes of the
+    100-Car study (its public event table). 0 switches it off."""
+    evasive_distance: float = 1.0
+    """How far they steer [m], less where their body would leave the lane: assumed, between the 2 ft of drivers over 25
+    and the 6 ft of younger ones in SHRP 2 (SAE 2015-01-1417, its abstract). It is steered open loop, as people do:
+    Markkula, Benderius and Wahde ("Comparing and validating models of driver steering behaviour in collision avoidance
+    and vehicle stabilisation", Vehicle System Dynamics 52, 2014)."""
+    evasive_acceleration: float = 0.4 * STANDARD_GRAVITY
+    """Acceleration across, in this manoeuvre [m/s^2]: assumed, half of what braking may be."""
+    evasive_reach: float = 1.0
+    """Bodies that come in beside the own one or within this way ahead or behind [m] are steered away from: assumed."""
+    evasive_clearance: float = 0.8
+    """... and those with less than this between the sides, were the own one in the middle of its lane [m]: assumed."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
             value = getattr(self, each.name)
             if isinstance(value, int | float) and not value >= 0:
                 raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
+        if self.reaction_time > LONGEST_REACTION:
+            warnings.warn(
+                f"reaction_time={self.reaction_time:g} s: above {LONGEST_REACTION} s this model of braking is wrong. "
+                "At 1 s its drivers touch braking leads a hundred times as often as people do, or more; results with "
+                "it say nothing about people who react late.",
+                stacklevel=3,
+            )
 
 
-def in_wandering_zone(state: State, road: Road, wandering: float) -> Tensor:
-    """Return which vehicles are in the ego's lane, or off the next's centre towards it by `wandering` [m], (B, V)."""
-    lane_y = road.centre_of(state.y[:, :1])
-    return (state.y[:, 1:] - lane_y).abs() <= road.width - wandering
+SEEN_WIDTH = 1.8
+"""Width of a car as it is seen from behind [m], assumed."""
 
 
-def look(state: State, noticed: Tensor) -> Percept:
-    """Return what there is to see of V other vehicles, of which some are noticed (B, V)."""
-    speed = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
-    return Percept(state.x[:, 1:] - state.x[:, :1], speed, noticed)
+class Ahead(NamedTuple):
+    """The nearest noticed vehicle ahead of B drivers, shape (B,) each; only the gap has a meaning for nobody."""
+
+    gap: Tensor
+    """Bumper to bumper [m], negative side by side, inf for nobody."""
+    speed: Tensor
+    """Of the vehicle along the driver's heading [m/s]."""
+    acceleration: Tensor
+    """Of the vehicle [m/s^2]."""
 
 
-def inverse_tau(percept: Percept, speed: Tensor) -> Tensor:
-    """Return how fast the most urgent leader comes closer, as a share of its gap [1/s], (B,), 0 without: 1 / TTC."""
-    gap = (percept.distance - VEHICLE_LENGTH).clamp(min=NEAR_ZERO)
-    ahead = percept.noticed & (percept.distance >= 0.0)
-    closing = torch.where(ahead, speed[:, None] - percept.speed, 0.0)
-    return (closing / gap).amax(dim=1).clamp(min=0.0)
+def find_ahead(state: State, noticed: Tensor, before: Tensor, dt: float) -> Ahead:
+    """Return the nearest ahead of the V other vehicles that are noticed, with their speeds a tick before; (B, V)."""
+    ahead = state.x[:, 1:] - state.x[:, :1]
+    distance, nearest = torch.where(noticed & (ahead >= 0.0), ahead, torch.inf).min(dim=1)
+    which = nearest[:, None]
+    speed, heading, former = (
+        each.gather(1, which)[:, 0] for each in (state.speed[:, 1:], state.heading[:, 1:], before)
+    )
+    along = speed * torch.cos(heading - state.heading[:, 0])
+    return Ahead(distance - VEHICLE_LENGTH, along, (speed - former) / dt)
+
+
+def expansion_rate(gap: Tensor, closing: Tensor) -> Tensor:
+    """Return how fast the angle grows under which a lead is seen [rad/s], W dv / (s^2 + W^2 / 4), (B,).
+
+    Example:
+        >>> expansion_rate(torch.tensor([20.0, torch.inf]), torch.tensor([1.0, 1.0]))
+        tensor([0.0045, 0.0000])
+    """
+    return closing * SEEN_WIDTH / (gap.clamp_min(0.0).square() + SEEN_WIDTH**2 / 4)
+
+
+LAMBLE_ECCENTRICITIES: Final = (0.0, 17.0, 24.0, 44.0, 63.0, 90.0)
+"""[deg]; the columns of the next two."""
+LAMBLE_AT_20_M: Final = (0.00380, 0.00617, 0.00646, 0.00739, 0.00858, 0.01483)
+"""Expansion rate [rad/s] of a lead 20 m ahead at which drivers who looked at a display noticed that it came nearer:
+Lamble, Laakso and Summala ("Detection thresholds in car following situations and peripheral vision", Ergonomics 42,
+1999, figure 4, as digitised in github.com/gmarkkula/HFES2014ModelsAndFigs). It agrees with their abstract, by which
+6 to 8 s were left until contact at 0 degrees and 4 s at 90, behind a lead that slowed down by 0.7 m/s^2. They expected
+it to: drivers who do not may see less."""
+LAMBLE_AT_40_M: Final = (0.00211, 0.00452, 0.00498, 0.00710, 0.00731, 0.01302)
+"""... 40 m ahead."""
+EDGE_OF_SIGHT = 90.0
+"""Eccentricity beyond which nothing is seen [deg], the largest of the table."""
+
+
+def seen_expansion_rate(gap: Tensor, eccentricity: float) -> Tensor:
+    """Return from which expansion rate [rad/s] on a lead is seen to come nearer, by its gap [m], (B,).
+
+    Interpolated in eccentricity [deg] and in the logarithm of the gap; nearer than 20 m as at 20 m, beyond 40 m as at
+    40 m, beyond the edge of sight inf.
+
+    Example:
+        >>> seen_expansion_rate(torch.tensor([10.0, 20.0, 28.28, 40.0]), 24.0)
+        tensor([0.0065, 0.0065, 0.0057, 0.0050])
+    """
+    if eccentricity > EDGE_OF_SIGHT:
+        return torch.full_like(gap, torch.inf)
+    near, far = (float(np.interp(eccentricity, LAMBLE_ECCENTRICITIES, at)) for at in (LAMBLE_AT_20_M, LAMBLE_AT_40_M))
+    return torch.log2(gap.clamp(20.0, 40.0)) * (far - near) + (near - (far - near) * math.log2(20.0))
 
 
 def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) -> Tensor:
@@ -213,36 +303,58 @@ def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) ->
     return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
 
 
-def estimate_leads(percept: Percept, speed: Tensor, errors: Tensor, model: HumanDriverModel) -> Lead:
-    """Return gaps and speed differences to V leaders as a driver estimates them, (B, V), with gap inf for others.
+FARTHEST = 1e4
+"""The error of a speed difference grows up to this gap [m]; of a gap to nobody there is none."""
 
-    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v with errors w_s and w_v (B, 2); bodies in between are no gap.
+
+def estimate(ahead: Ahead, speed: Tensor, errors: Tensor, model: HumanDriverModel) -> Lead:
+    """Return gap and speed difference to a lead as drivers at speeds (B,) estimate them, with errors w_s, w_v (B, 2).
+
+    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v.
     """
-    ahead = percept.noticed & (percept.distance >= 0.0)
-    way = torch.where(ahead, percept.distance, torch.inf)
-    between = (way[:, None, :] < way[:, :, None]).sum(dim=2)
-    led = ahead & (between < max(model.leaders, 1))
-    gap = torch.where(led, percept.distance - VEHICLE_LENGTH * (between + 1), 0.0)
-    error = gap.abs() * model.approach_error * errors[:, 1:]
-    estimated = gap * torch.exp(model.gap_error * errors[:, :1])
-    closing = torch.where(led, speed[:, None] - percept.speed + error, 0.0)
-    return Lead(torch.where(led, estimated, torch.inf), closing)
+    gap_error, approach_error = errors.unbind(1)
+    error = ahead.gap.abs().clamp_max(FARTHEST) * (approach_error * model.approach_error)
+    return Lead(ahead.gap * torch.exp(gap_error * model.gap_error), speed - ahead.speed + error)
 
 
 def anticipate(lead: Lead, speed: Tensor, acceleration: Tensor, delay: float) -> tuple[Lead, Tensor]:
-    """Return leads (B, V) and own speed (B,) after a delay [s] in which other speeds and the own acceleration stay."""
-    expected = lead._replace(gap=lead.gap - delay * lead.closing_speed)
-    return expected, (speed + delay * acceleration).clamp(min=0.0)
+    """Return a lead and own speed (B,) after a delay [s] in which its speed and the own acceleration stay."""
+    expected = lead._replace(gap=lead.gap - lead.closing_speed * delay)
+    return expected, (speed + acceleration * delay).clamp(min=0.0)
 
 
-def respond(lead: Lead, speed: Tensor, model: HumanDriverModel) -> Tensor:
-    """Return the acceleration that a driver chooses behind V leads (B, V) as it expects them [m/s^2], (B,).
+def respond(lead: Lead, lead_acceleration: Tensor, speed: Tensor, model: HumanDriverModel) -> Tensor:
+    """Return the acceleration that drivers at speeds (B,) choose behind leads as they expect them [m/s^2], (B,).
 
-    (s*/s_j)^2 of n leaders are weighted by 1 / sum_j j^-2: a queue in equilibrium keeps the gaps of the IDM.
+    The improved IDM with the heuristic, by the lead's acceleration where it brakes; behind seen braking without it.
     """
-    ratio = speed / model.idm.desired_speed
-    each = model.idm.interaction(speed[:, None], ratio[:, None], lead)
-    seen = torch.isfinite(lead.gap).sum(dim=1)
-    weights = [1.0 / sum(j**-2 for j in range(1, n + 1)) if n else 1.0 for n in range(lead.gap.shape[1] + 1)]
-    weight = constant(tuple(weights), speed)[seen]
-    return model.idm.combine(ratio, weight * each.sum(dim=1))
+    coolness = (lead_acceleration >= -model.brake_light).to(speed.dtype) * model.coolness
+    return improved_acceleration(model.idm, speed, lead, lead_acceleration.clamp_max(0.0), coolness=coolness)
+
+
+def evasive_steps(distance: float, acceleration: float, dt: float) -> tuple[float, ...]:
+    """Return the ways across in each tick [m], by which one moves so far and comes to rest: half the time each way.
+
+    Example:
+        >>> steps = evasive_steps(1.0, 4.0, 0.1)  # 1 s: faster by 4 m/s^2 for half of it, slower for the other
+        >>> len(steps), round(sum(steps), 6), round(max(steps) / 0.1, 2)
+        (10, 1.0, 1.8)
+    """
+    if not distance > 0.0 or not acceleration > 0.0:
+        return ()
+    lasting = 2.0 * math.sqrt(distance / acceleration)
+    u = np.minimum(np.arange(math.ceil(lasting / dt - 1e-9) + 1) * dt / lasting, 1.0)
+    place = np.where(u < 0.5, 2.0 * u**2, 1.0 - 2.0 * (1.0 - u) ** 2)
+    return tuple((distance * np.diff(place)).tolist())
+
+
+def steer_along(way: Tensor, heading: Tensor, speed: Tensor, dt: float) -> Tensor:
+    """Return the steering angles [rad] by which the bicycle model moves so far across in a tick [m], (B,) each.
+
+    Its course is heading + slip, so the slip is the course that is wanted less the heading. Slow vehicles, which would
+    have to turn by more than 45 degrees, move as far as that takes them.
+    """
+    most = math.sin(MAX_HEADING_COMMAND)
+    course = torch.asin((way / (speed * dt).clamp_min(NEAR_ZERO * dt)).clamp(-most, most))
+    limit = math.asin(MAX_SLIP_SINE)
+    return torch.atan(2.0 * torch.tan((course - heading).clamp(-limit, limit)))

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.devices import are_zero, scalars
+from rare_envs.devices import are_zero, may_hold, scalars
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import NEAR_ZERO, VEHICLE_LENGTH, steering_for
@@ -196,26 +196,31 @@ def improved_acceleration(
         '-1.55'
     """
     a, b, limit = idm.max_acceleration, idm.comfortable_deceleration, idm.max_deceleration
-    wanted = torch.full_like(speed, idm.desired_speed) if desired_speed is None else desired_speed
-    gap, closing = lead.gap.clamp_min(NEAR_ZERO), torch.where(torch.isfinite(lead.gap), lead.closing_speed, 0.0)
-    z = torch.where(torch.isfinite(gap), idm.interaction(speed, speed / wanted, lead).sqrt(), 0.0)
-    improved = _improve(a, b, idm.exponent, speed / wanted, z)
-    held = torch.clamp(torch.as_tensor(lead_acceleration, dtype=speed.dtype, device=speed.device), max=a)
-    ahead, room = speed - closing, 2.0 * gap
-    stopping = speed.square() * held / (ahead.square() - room * held).clamp_min(NEAR_ZERO)
+    ratio = speed / (scalars((idm.desired_speed,), speed)[0] if desired_speed is None else desired_speed)
+    improved = _improve(a, b, idm.exponent, ratio, idm.interaction(speed, ratio, lead))
+    closing, room = lead.closing_speed, lead.gap.clamp(NEAR_ZERO, FAR_AWAY) * 2.0
+    held = torch.as_tensor(lead_acceleration, dtype=speed.dtype, device=speed.device).clamp_max(a)
+    ahead, change = (speed - closing).clamp_min(0.0), room * held
+    stopping = speed.square() * held / (ahead.square() - change).clamp_min(NEAR_ZERO)
     closing_up = held - closing.clamp_min(0.0).square() / room
-    heuristic = torch.where(ahead * closing <= -room * held, stopping, closing_up)
-    heuristic = torch.where(torch.isfinite(gap), heuristic, improved)
-    milder = heuristic + b * torch.tanh((improved - heuristic) / b)
-    both = torch.where(improved >= heuristic, improved, (1.0 - coolness) * improved + coolness * milder)
-    return both.clamp(-limit, a)
+    heuristic = torch.where(ahead * closing < -change, stopping, closing_up)
+    less = (improved - heuristic).clamp_max(0.0)
+    both = torch.lerp(improved, torch.tanh(less / b) * b + heuristic, (lead.gap < FAR_AWAY).to(speed.dtype) * coolness)
+    return torch.where(less < 0.0, both, improved).clamp(-limit, a)
 
 
-def _improve(a: float, b: float, exponent: float, ratio: Tensor, z: Tensor) -> Tensor:
-    """Return the improved IDM's acceleration [m/s^2] by v / v0 and s* / s, (B,) each."""
-    below = a * (1.0 - ratio.clamp(max=1.0).pow(exponent))
-    above = -b * (1.0 - ratio.clamp_min(1.0).pow(-a * exponent / b))
-    near = a * (1.0 - z.square())
-    share = torch.exp(2.0 * a / below.clamp_min(1e-3) * torch.log(z.clamp(1e-12, 1.0)))
-    slow = torch.where(z >= 1.0, near, below * (1.0 - share))
-    return torch.where(ratio <= 1.0, slow, above + near.clamp(max=0.0))
+FAR_AWAY = 1e6
+"""Beyond this gap [m] there is nobody."""
+
+
+def _improve(a: float, b: float, exponent: float, ratio: Tensor, interaction: Tensor) -> Tensor:
+    """Return the improved IDM's acceleration [m/s^2] by v / v0 and (s* / s)^2, (B,) each."""
+    below = (1.0 - ratio.clamp_max(1.0).pow(exponent)) * a
+    near = a - interaction * a
+    share = torch.exp(torch.log(interaction.clamp(MIN_RATIO, 1.0)) * (a / below.clamp_min(1e-3)))
+    slow = torch.where(interaction >= 1.0, near, below - below * share)
+    fast = ratio > 1.0
+    if not may_hold(fast):
+        return slow
+    above = (ratio.clamp_min(1.0).pow(-a * exponent / b) - 1.0) * b
+    return torch.where(fast, above + near.clamp_max(0.0), slow)

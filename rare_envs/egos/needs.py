@@ -20,7 +20,7 @@ from gymnasium import spaces
 
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
-from rare_envs.egos.human import HumanEgo
+from rare_envs.egos.human import HUMAN_EGOS
 from rare_envs.egos.wrappers import find_action_bounds, find_frame_stacking
 from rare_envs.plugins import check_predict, is_policy, refuse_ego
 from rare_envs.simulation.observation import ELSEWHERE, OBSERVATIONS, map_kinds, observation_space, read_kinds
@@ -201,7 +201,7 @@ def name_ambiguities(action_space: Any, kinds: Collection[str]) -> tuple[str, ..
     return tuple(found)
 
 
-RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), "human": HumanEgo()})
+RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), **HUMAN_EGOS})
 """Egos that are known by a name."""
 
 
@@ -228,7 +228,7 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
 
 
 def find_rule_based(ego: Any) -> Any:
-    """Return the driver that "idm" or "human" names, a policy for a plain function, and any other ego as it is."""
+    """Return the driver that a rule-based ego's name means, a policy for a plain function, any other ego as it is."""
     ego = RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else wrap_callable(ego)
     if isinstance(ego, str | type):  # a class has the attributes of its egos
         refuse_ego(ego, known=tuple(RULE_BASED_EGOS))

@@ -23,6 +23,7 @@ import numpy as np
 import agents
 import samplers
 from agents.loading import find_ego_kind
+from rare_envs.egos.needs import RULE_BASED_EGOS
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
@@ -188,7 +189,7 @@ class RowKeeper:
 def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
     """Simulate the kept scenarios again: in another order and in small batches, and a few each alone."""
     problem = study.problem
-    rules = isinstance(problem.ego, str) and problem.ego in ("idm", "human") and ":" not in study.question.measure
+    rules = isinstance(problem.ego, str) and problem.ego in RULE_BASED_EGOS and ":" not in study.question.measure
     if problem.needs.varies or rules:
         return None
     x, f = kept.rows

@@ -8,31 +8,33 @@ import torch
 
 from rare_envs.control.human_driver import (
     GLANCE_CDF,
+    LAMBLE_AT_20_M,
+    LAMBLE_AT_40_M,
+    LAMBLE_ECCENTRICITIES,
     MEAN_GLANCE,
     MEAN_ON_ROAD,
     OFF_ROAD_SHARE,
+    Ahead,
     Glances,
     HumanDriverModel,
-    Percept,
     count_glance_draws,
     draw_glances,
-    estimate_leads,
+    estimate,
+    evasive_steps,
+    expansion_rate,
+    find_ahead,
     remaining_duration,
     respond,
+    seen_expansion_rate,
+    steer_along,
     step_errors,
 )
 from rare_envs.control.idm import IDM
 from rare_envs.traffic.bodies import Lead
+from rare_envs.traffic.state import STANDARD_GRAVITY, State, bicycle
 from tests.rare_envs.traffic_states import F64, tensor
 
 MODEL = HumanDriverModel()
-NO_ERRORS = torch.zeros(1, 2, dtype=F64)
-
-
-def percept(*vehicles: tuple[float, float, bool]) -> Percept:
-    """One scenario; distance of centres, speed, noticed."""
-    distance, speed, noticed = zip(*vehicles, strict=True)
-    return Percept(tensor(*distance)[None], tensor(*speed)[None], torch.tensor([noticed]))
 
 
 def test_errors_have_variance_one_and_the_published_correlation_time() -> None:
@@ -49,42 +51,90 @@ def test_errors_have_variance_one_and_the_published_correlation_time() -> None:
 
 
 def test_gap_and_speed_difference_are_misjudged_as_published() -> None:
-    lead = estimate_leads(percept((25.0, 12.0, True)), tensor(15.0), tensor(1.0, -2.0)[None], MODEL)
-    assert lead.gap.item() == pytest.approx(20.0 * math.exp(0.1))
-    assert lead.closing_speed.item() == pytest.approx(3.0 - 2.0 * 0.01 * 20.0)
+    ahead = Ahead(tensor(20.0, math.inf), tensor(12.0, 3.0), tensor(0.0, 0.0))
+    lead = estimate(ahead, tensor(15.0, 15.0), tensor(1.0, -2.0)[None], MODEL)
+    assert lead.gap.tolist() == pytest.approx([20.0 * math.exp(0.1), math.inf])
+    assert lead.closing_speed[0].item() == pytest.approx(3.0 - 2.0 * 0.01 * 20.0)
 
 
-def test_gaps_to_several_leaders_leave_out_the_bodies_in_between() -> None:
-    others = percept((60.0, 10.0, True), (20.0, 12.0, True), (-20.0, 15.0, True), (30.0, 15.0, False))
-    lead = estimate_leads(others, tensor(15.0), NO_ERRORS, MODEL)
-    assert lead.gap.tolist() == [[50.0, 15.0, math.inf, math.inf]]
-    assert lead.closing_speed.tolist() == [[5.0, 3.0, 0.0, 0.0]]
-    nearest = estimate_leads(others, tensor(15.0), NO_ERRORS, HumanDriverModel(leaders=1))
-    assert nearest.gap.tolist() == [[math.inf, 15.0, math.inf, math.inf]]
+def test_the_nearest_that_is_noticed_and_ahead_is_followed() -> None:
+    x, speed = tensor(0.0, 60.0, 30.0, 20.0, -4.0)[None], tensor(15.0, 12.0, 10.0, 9.0, 8.0)[None]
+    state = State(x, 0 * x, 0 * x, speed, x[:, :0])
+    noticed, before = torch.tensor([[True, True, False, True]]), speed[:, 1:] + 0.2
+    ahead = find_ahead(state, noticed, before, 0.1)
+    assert [each.item() for each in ahead] == pytest.approx([25.0, 10.0, -2.0])
+    assert find_ahead(state, noticed & (x[:, 1:] < 0.0), before, 0.1).gap.item() == math.inf
 
 
-def test_one_leader_is_answered_as_by_the_idm() -> None:
-    lead = Lead(tensor(20.0, math.inf, 3.0), tensor(4.0, 0.0, 9.0))
-    expected = MODEL.idm.acceleration(tensor(15.0, 10.0, 15.0), lead)
-    alone = Lead(*(each[:, None] for each in lead))
-    assert respond(alone, tensor(15.0, 10.0, 15.0), MODEL).tolist() == expected.tolist()
-    assert expected[2].item() == pytest.approx(-0.774 * 9.80665)
+def test_a_lead_is_braked_for_by_the_heuristic_until_its_braking_is_seen() -> None:
+    """v = 20 m/s, 10 m behind 18 m/s: improved IDM 1 - 3.83^2, at most 0.774 g; heuristic -2^2 / 20, see `idm`."""
+    model = HumanDriverModel(idm=IDM(1e3, 1.0, 1.0, 1.5, jam_distance=2.0, jam_distance_speed=0.0, cut_off=True))
+    lead, speed = Lead(tensor(10.0), tensor(2.0)), tensor(20.0)
+    improved = 1 - ((2 + 20 + 20 * 2 / (2 * math.sqrt(1.5))) / 10) ** 2
+    for lead_acceleration, heuristic in ((0.0, -0.2), (1.0, -0.2), (-0.49, -0.49 - 0.2)):
+        expected = 0.01 * improved + 0.99 * (heuristic + 1.5 * math.tanh((improved - heuristic) / 1.5))
+        found = respond(lead, tensor(lead_acceleration), speed, model).item()
+        assert found == pytest.approx(expected, abs=1e-9)
+    assert respond(lead, tensor(-0.51), speed, model).item() == -5.0
 
 
-@pytest.mark.parametrize("leaders", [1, 2, 5])
-def test_a_queue_in_equilibrium_keeps_the_gap_of_the_idm(leaders: int) -> None:
-    """Equal speeds and gaps s: sum_j (s* / (j s))^2 / sum_j j^-2 = (s* / s)^2, so a = 0 where IDM's is."""
-    speed, v0 = 15.0, 120 / 3.6
-    gap = (2.0 + 1.0 * speed) / math.sqrt(1 - (speed / v0) ** 4)
-    queue = percept(*((j * (gap + 5.0), speed, True) for j in range(1, leaders + 1)))
-    lead = estimate_leads(queue, tensor(speed), NO_ERRORS, MODEL)
-    assert respond(lead, tensor(speed), MODEL).item() == pytest.approx(0.0, abs=1e-12)
+def test_a_standing_lead_is_not_run_into() -> None:
+    """Behind a lead that stands, from 15 m/s and 60 m: the heuristic alone stops with constant -15^2 / 120."""
+    model = HumanDriverModel(coolness=1.0)
+    gap, speed = tensor(60.0), tensor(15.0)
+    while speed > 0.1:
+        acceleration = respond(Lead(gap, speed), tensor(0.0), speed, model)
+        gap, speed = gap - speed * 0.01, (speed + acceleration * 0.01).clamp(min=0.0)
+    assert 0.0 < gap.item() < 5.0
 
 
-def test_the_cut_off_keeps_a_driver_from_braking_for_a_lead_that_pulls_away() -> None:
-    away = Lead(tensor(10.0), tensor(-20.0))
-    assert MODEL.idm.acceleration(tensor(20.0), away).item() == pytest.approx(1 - (20 * 3.6 / 120) ** 4 - 0.2**2)
-    assert IDM().acceleration(tensor(20.0), away).item() == -5.0
+def test_longer_reaction_times_are_warned_of() -> None:
+    with pytest.warns(UserWarning, match="this model of braking is wrong"):
+        HumanDriverModel(reaction_time=0.8)
+
+
+@pytest.mark.parametrize("gap", [5.0, 20.0, 40.0, 200.0])
+def test_looming_is_seen_from_the_published_rates_on(gap: float) -> None:
+    table = LAMBLE_AT_20_M if gap <= 20.0 else LAMBLE_AT_40_M
+    found = [seen_expansion_rate(tensor(gap), eccentricity).item() for eccentricity in LAMBLE_ECCENTRICITIES]
+    assert found == pytest.approx(table, rel=1e-12)
+    halfway = seen_expansion_rate(tensor(20.0 * math.sqrt(2.0)), 34.0).item()
+    assert halfway == pytest.approx((0.00646 + 0.00739 + 0.00498 + 0.00710) / 4, rel=1e-12)
+    assert seen_expansion_rate(tensor(gap), 90.1).item() == math.inf
+
+
+@pytest.mark.parametrize(("eccentricity", "distance", "left"), [(0, 20, 6), (0, 40, 8), (90, 20, 4), (90, 40, 4)])
+def test_the_rates_leave_the_time_that_their_authors_tell(eccentricity: int, distance: int, left: int) -> None:
+    """Lamble et al.'s abstract: the lead slows down by 0.7 m/s^2, so that contact is after sqrt(2 x distance / 0.7)."""
+    t = torch.arange(0.0, math.sqrt(2 * distance / 0.7), 0.01, dtype=F64)
+    rate = expansion_rate(distance - 0.35 * t**2, 0.7 * t)
+    seen = rate >= seen_expansion_rate(tensor(float(distance)), float(eccentricity))
+    assert round(math.sqrt(2 * distance / 0.7) - t[seen][0].item()) == left
+
+
+def test_the_expansion_rate_is_the_slope_of_the_angle_of_sight() -> None:
+    gap, closing, dt = 12.0, 3.0, 1e-6
+    angle = [2 * math.atan(0.9 / (gap - closing * t)) for t in (-dt, dt)]
+    assert expansion_rate(tensor(gap), tensor(closing)).item() == pytest.approx((angle[1] - angle[0]) / (2 * dt))
+
+
+@pytest.mark.parametrize("speed", [6.0, 15.0, 30.0])
+def test_the_bicycle_model_moves_a_metre_aside_with_the_acceleration_of_the_manoeuvre(speed: float) -> None:
+    """One metre with 0.4 g there and back takes 2 sqrt(1 / 0.4 g) = 1.01 s, 0.99 m/s faster and slower again each."""
+    limit, dt = 0.4 * STANDARD_GRAVITY, 0.1
+    steps = evasive_steps(1.0, limit, dt)
+    assert len(steps) == math.ceil(2 * math.sqrt(1.0 / limit) / dt)
+    x, y, heading, v = tensor(0.0), tensor(0.0), tensor(0.0), tensor(speed)
+    places = [0.0, 0.0]
+    for way in (*steps, 0.0, 0.0, 0.0):
+        steering = steer_along(tensor(way), heading, v, dt)
+        x, y, heading, v = bicycle(x, y, heading, v, tensor(0.0), steering, dt)
+        places.append(y.item())
+    across = np.diff(places, 2) / dt**2
+    assert places[-1] == pytest.approx(1.0, abs=1e-9)
+    assert np.abs(across).max() == pytest.approx(limit, rel=0.1)
+    assert np.abs(across).max() <= limit * (1 + 1e-9)
+    assert abs(heading.item()) < 0.05
 
 
 N, HORIZON = 40_000, 10.0

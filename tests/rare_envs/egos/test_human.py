@@ -1,4 +1,4 @@
-"""The human ego in its worlds: IDM without human limits, late by its reaction time, its randomness all in x."""
+"""The human ego in its worlds: without human limits its car-following model, late by its reaction time, all in x."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ import torch
 import agents
 import rare_envs
 from rare_envs.control.human_driver import Glances, HumanDriverModel
-from rare_envs.control.idm import IDM
+from rare_envs.control.idm import IDM, improved_acceleration
 from rare_envs.egos.human import HumanDriver, HumanEgo
+from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World, drive
+from rare_envs.traffic.bodies import lead_index
+from rare_envs.traffic.road import straight
 
 SCENARIOS = ("CarFollowing", "CutIn", "HardBrake")
 FLAWLESS = HumanDriverModel(
@@ -23,13 +26,13 @@ FLAWLESS = HumanDriverModel(
     reaction_time=0.0,
     gap_error=0.0,
     approach_error=0.0,
-    leaders=1,
     wandering=1.0,  # as far as `lead_of` sees into the next lane
     noticing_time=0.0,
     jerk=math.inf,
     glances=False,
+    evasive_share=0.0,
 )
-SURE = HumanDriverModel(gap_error=0.0, approach_error=0.0, glances=False)
+SURE = HumanDriverModel(gap_error=0.0, approach_error=0.0, glances=False, evasive_share=0.0)
 
 
 def problem(name: str, ego: Any = "human", **kwargs: Any) -> rare_envs.DrivingProblem:
@@ -46,11 +49,27 @@ def accelerations(driver: HumanDriver, world: World, x: list[float]) -> list[flo
     return decided
 
 
+class Heuristic:
+    """The improved IDM with the heuristic, by all that there is to know."""
+
+    def act(self, episode: Episode, memory: Any) -> tuple[torch.Tensor, Any]:
+        """Answer the ego's lead; behind one that brakes by more than 0.5 m/s^2 without the heuristic."""
+        state, index = episode.state, lead_index(episode.state, episode.road)[:, None]
+        before = state if memory is None else memory
+        braking = ((state.speed - before.speed) / 0.1).gather(1, index)[:, 0]
+        cool = 0.99 * (braking >= -0.5).double()
+        wanted = improved_acceleration(IDM(), state.speed[:, 0], episode.lead, braking.clamp(max=0.0), coolness=cool)
+        return torch.stack((wanted, torch.zeros_like(wanted)), dim=1), state
+
+
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_without_human_limits_it_is_the_idm(name: str) -> None:
+def test_without_human_limits_it_is_the_improved_idm_with_the_heuristic(name: str) -> None:
     flawless, idm = problem(name, HumanEgo(FLAWLESS)), problem(name, "idm")
     x = torch.from_numpy(idm.base.sample(200, np.random.default_rng(0)))
-    for ours, theirs in zip(drive(flawless.world, flawless.driver, x), drive(idm.world, IDM(), x), strict=True):
+    if name == "CutIn":
+        x[:, 5] = x[:, 5].clamp(max=4.0)  # from further away a driver notices sooner than a lead begins to count
+    ego = drive(flawless.world, flawless.driver, x)
+    for ours, theirs in zip(ego, drive(idm.world, Heuristic(), x), strict=True):
         there = ~theirs.collided
         torch.testing.assert_close(ours.state.speed[there], theirs.state.speed[there], rtol=1e-9, atol=1e-9)
 
@@ -65,15 +84,16 @@ def test_a_braking_lead_is_answered_one_reaction_time_later(late: float) -> None
     assert differ.index(True) == round(late / 0.1) + 1
 
 
-def test_a_cutter_is_answered_after_noticing_and_reacting() -> None:
-    """It begins outside of the zone in which it counts and enters it in tick k: 0.4 s to notice, 0.6 s to react."""
+@pytest.mark.parametrize("offset", [4.0, 4.8])
+def test_a_cutter_is_answered_after_noticing_and_reacting(offset: float) -> None:
+    """It is noticed 0.375 m from where it began, or from its lane's centre: in tick k, then 0.4 s and 0.6 s later."""
     world = problem("CutIn").world
-    x = [15.0, 12.0, 15.0, 15.0, 60.0, 4.0]
+    x = [15.0, 12.0, 15.0, 15.0, 60.0, offset]
     driver = HumanDriver(SURE, world)
     blind = HumanDriver(replace(SURE, noticing_time=100.0), world)
     differ = [a != b for a, b in zip(accelerations(driver, world, x), accelerations(blind, world, x), strict=True)]
     offsets = [float(each.state.y[0, 1]) for each in drive(world, blind, torch.tensor([x], dtype=torch.float64))]
-    entered = next(tick for tick, y in enumerate(offsets) if y <= 4.0 - 0.375)
+    entered = next(tick for tick, y in enumerate(offsets) if y <= offset - 0.375)
     assert 0 < entered < 20
     assert differ.index(True) == entered + 4 + 6
 
@@ -85,27 +105,33 @@ def test_braking_builds_up_at_the_published_rate_to_the_published_maximum() -> N
     assert min(decided) == pytest.approx(-0.774 * 9.80665)
 
 
+def look_away(model: HumanDriverModel, x: list[float], glance: tuple[float, float], ticks: int = 45) -> Any:
+    """Episodes and memories in car following of a driver who would like to look away from a time to another [s]."""
+    world = problem("CarFollowing").world
+    start, end = (torch.tensor([[0.0, each]], dtype=torch.float64) for each in glance)
+    driver = HumanDriver(model, world, glances=Glances(start, end))
+    episode, memory = world.start(torch.tensor([x], dtype=torch.float64)), None
+    for _ in range(ticks):
+        action, memory = driver.act(episode, memory)
+        yield episode, memory
+        episode = world.step(episode, action)
+
+
 def test_what_was_there_at_the_start_does_not_move_before_it_was_seen() -> None:
     """In the first reaction time the percept stays that of time 0, also with the eyes off the road."""
-    world = problem("CarFollowing").world
-    glance = Glances(torch.tensor([[0.0, 0.0]]), torch.tensor([[0.0, 3.0]]))
-    driver = HumanDriver(SURE, world, glances=glance)
-    episode, memory = world.start(torch.tensor([[20.0, 10.0, 80.0]], dtype=torch.float64)), None
-    known = []
-    for _ in range(driver.delay + 3):
-        action, memory = driver.act(episode, memory)
-        episode = world.step(episode, action)
-        known.append(float(memory.known.distance[0, 0]))
-    assert bool(memory.away)
-    assert known[: driver.delay + 1] == [known[0]] * (driver.delay + 1)
-    assert known[driver.delay + 1] == pytest.approx(known[0] - 0.1 * 10.0, rel=1e-6)
+    free = replace(SURE, glance_looming=1.0, glance_eccentricity=180.0)
+    known = [memory for _, memory in look_away(free, [20.0, 10.0, 80.0], (0.0, 3.0), 9)]
+    gaps = [float(memory.known.gap) for memory in known]
+    assert bool(known[-1].glance.away)
+    assert gaps == [pytest.approx(80.0)] * 7 + [pytest.approx(80.0 - 0.1 * 10.0), gaps[8]]
 
 
 def test_in_a_glance_the_lead_is_taken_to_keep_its_speed() -> None:
     world = problem("HardBrake").world
     glance = Glances(torch.tensor([[0.0, 0.5]]), torch.tensor([[0.0, 2.5]]))
-    model = replace(SURE, reaction_time=0.0)
-    x, until = [15.0, 40.0, 4.0], 5
+    free = replace(SURE, glance_looming=1.0, headway_rule=False, glance_eccentricity=180.0)
+    model = replace(free, reaction_time=0.0)
+    x, until = [15.0, 20.0, 4.0], 5
     away = accelerations(HumanDriver(model, world, glances=glance), world, x)
     seeing = accelerations(HumanDriver(model, world), world, x)
     assert away[:until] == seeing[:until]
@@ -113,19 +139,79 @@ def test_in_a_glance_the_lead_is_taken_to_keep_its_speed() -> None:
     assert away[26] < away[24] - 1.0  # it looks back, and brakes
 
 
-def test_no_glance_is_begun_in_danger_and_none_is_broken_off() -> None:
-    """Closing at 10 m/s from 40 m: the share is 0.25 per second, above 0.2; from 80 m it is below at first."""
-    world = problem("CarFollowing").world
-    glance = Glances(torch.tensor([[0.0, 0.3]]), torch.tensor([[0.0, 4.0]]))
-    for gap, looks_away in ((40.0, False), (80.0, True)):
-        driver = HumanDriver(replace(SURE, reaction_time=0.0), world, glances=glance)
-        episode, memory = world.start(torch.tensor([[20.0, 10.0, gap]])), None
-        away = []
-        for _ in range(45):
-            action, memory = driver.act(episode, memory)
-            episode = world.step(episode, action)
-            away.append(bool(memory.away))
-        assert away == [False] * 3 + [looks_away] * 37 + [False] * 5
+@pytest.mark.parametrize(
+    ("speed", "gap", "begun"),
+    [(20.0, 58.0, True), (20.0, 50.0, False), (15.0, 24.0, True), (16.0, 24.0, False), (25.0, 49.0, False)],
+)
+def test_no_glance_is_begun_while_something_comes_nearer(speed: float, gap: float, begun: bool) -> None:
+    """Behind 15 m/s: 1.8 m x 5 m/s / gap^2 is .0027 and .0036 rad/s; at 1 m/s from 24 m .0031; 10 m/s from 49 m."""
+    model = replace(SURE, reaction_time=0.0, headway_rule=False, glance_ttc=5.0)
+    away = [bool(memory.glance.away) for _, memory in look_away(model, [speed, 15.0, gap], (0.0, 0.5), 1)]
+    assert away == [begun]
+    urgent = replace(model, glance_looming=1.0)  # by the time to collision alone: 10 m/s from 49 m is 4.9 s
+    away = [bool(memory.glance.away) for _, memory in look_away(urgent, [speed, 15.0, gap], (0.0, 0.5), 1)]
+    assert away == [gap != 49.0]
+
+
+def test_a_glance_is_broken_off_by_the_looming_that_is_seen_from_there() -> None:
+    """It ends in the first tick in which W dv / (s^2 + W^2 / 4) is at the rate of the table, and is not taken up."""
+    model = replace(SURE, reaction_time=0.0, headway_rule=False, glance_eccentricity=24.0, glance_looming=1.0)
+    model = replace(model, idm=replace(model.idm, comfortable_deceleration=9.0))  # it does not brake early
+    ended = []
+    for episode, memory in look_away(model, [20.0, 10.0, 80.0], (0.0, 8.0), 80):
+        gap, closing = episode.lead.gap.item(), episode.lead.closing_speed.item()
+        nearness = min(max(math.log2(gap / 20.0), 0.0), 1.0)
+        ended.append(1.8 * closing / (gap**2 + 0.81) >= 0.00646 + nearness * (0.00498 - 0.00646))
+        assert bool(memory.glance.away) is not any(ended)
+    assert 10 < ended.index(True) < 75
+    unseen = look_away(replace(model, glance_eccentricity=180.0), [20.0, 10.0, 80.0], (0.0, 4.0))
+    assert [memory.glance.away.item() for _, memory in unseen] == [True] * 40 + [False] * 5
+
+
+@pytest.mark.parametrize(("rule", "lasting"), [(True, 0.9), (False, 4.0)])
+def test_a_glance_is_no_longer_than_headway_less_reaction_time(rule: bool, lasting: float) -> None:
+    """30 m at 20 m/s are 1.5 s, of which 0.6 s are for reacting; it begins at 0.3 s, known 0.6 s later."""
+    model = replace(SURE, headway_rule=rule, idm=replace(SURE.idm, max_acceleration=1e-9))
+    away = [bool(memory.glance.away) for _, memory in look_away(model, [20.0, 20.0, 30.0], (0.25, 4.25), 60)]
+    assert (away.index(True), sum(away)) == (9, round(10 * lasting))
+
+
+def swerve(evades: bool, gap: float = -9.0, ego: float = 15.0, lane: float = 4.0) -> tuple[list[float], list[float]]:
+    """Places across of ego and cutter, which comes in beside it from the right and drives away."""
+    around = problem("CutIn").world
+    world = replace(around, scenario=replace(around.scenario, road=straight(2, lane)))
+    driver = HumanDriver(replace(SURE, evasive_share=0.48), world)
+    x = torch.tensor([[ego, ego + 4.0, ego + 8.0, gap, 60.0, 4.0, -0.1 if evades else 0.0]], dtype=torch.float64)
+    across = [each.state.y[0, :2].tolist() for each in drive(world, driver, x)]
+    return [y for y, _ in across], [y for _, y in across]
+
+
+def test_a_driver_who_steers_makes_room_for_who_comes_in_and_comes_back() -> None:
+    """By one metre, at 0.4 g at most, 0.6 s after a body is beside with 0.8 m between; back once it has passed."""
+    ego, cutter = swerve(True)
+    assert swerve(False)[0] == [0.0] * 101
+    begun = next(tick for tick, y in enumerate(ego) if y < 0.0)
+    near = next(tick for tick, y in enumerate(cutter) if y < 2.8)
+    assert begun == near + 6 + 1  # what is decided in a tick is seen in the next
+    assert min(ego) == pytest.approx(-1.0, abs=1e-9)
+    assert np.abs(np.diff(ego[: ego.index(min(ego)) + 1], 2)).max() <= 0.4 * 9.80665 * 0.1**2 * (1 + 1e-9)
+    assert abs(ego[-1]) < 0.02
+    assert np.abs(np.diff(ego, 2)).max() < 0.45 * 9.80665 * 0.1**2  # lane keeping takes over at the end
+
+
+def test_the_body_stays_inside_its_lane() -> None:
+    assert min(swerve(True, lane=3.5)[0]) == pytest.approx(-(3.5 - 2.0) / 2, abs=1e-9)
+
+
+def test_who_steers_is_a_column_of_x_and_only_a_part_do() -> None:
+    around = problem("CutIn")
+    assert isinstance(around.driver, HumanDriver)
+    draws = torch.zeros(2000, around.driver.noise_columns)
+    draws[:, -1] = torch.special.ndtri((torch.arange(2000) + 0.5) / 2000)
+    evades = around.driver.with_draws(draws).evades
+    assert evades is not None and evades.double().mean().item() == pytest.approx(0.48)
+    nobody = HumanEgo(replace(SURE, evasive_share=0.0)).in_world(around.world)
+    assert (nobody.noise_columns, HumanEgo(replace(SURE, glances=True)).in_world(around.world).evades) == (0, None)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -140,7 +226,7 @@ def test_everything_random_is_in_x(name: str) -> None:
     other[:, -columns:] = around.base.sample(40, np.random.default_rng(2))[:, -columns:]
     assert (around.evaluate(other) != f).any()
     assert around.space.names[-1] == "ego_noise"
-    assert columns == 2 * 20 + 2 + 2 * 12
+    assert columns == 2 * 20 + 2 + 2 * 12 + 1
     assert (around.given, around.varies) == ("", False)
 
 
