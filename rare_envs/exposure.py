@@ -46,16 +46,13 @@ __all__ = [
     "CollisionProbability",
     "CollisionRate",
     "EventCalibration",
-    "FurtherEvents",
     "HumanBenchmark",
     "ModelCount",
     "PeopleInEvent",
     "TotalRate",
     "VarianceShare",
     "calibration",
-    "describe_human_contacts",
     "people_in",
-    "summarise_human_contacts",
 ]
 
 SOURCE_FIELDS = ("site", "date", "data", "licence")
@@ -290,22 +287,6 @@ class VarianceShare(NamedTuple):
     """Of the variance of the logarithm of the sum of the determined rates."""
 
 
-class FurtherEvents(NamedTuple):
-    """How many more recorded events would halve the width of the total's interval, in logarithms.
-
-    Example:
-        >>> FurtherEvents("cut_in", number=None, own=114).own
-        114
-    """
-
-    scenario: str
-    """The scenario whose base distribution contributes most."""
-    number: int | None
-    """Further events; None where those of this scenario alone cannot halve it."""
-    own: int
-    """Further events that halve the spread of its own base distribution: three times those recorded."""
-
-
 @dataclass(frozen=True)
 class TotalRate:
     """Collisions per hour and per million km over scenarios that count nothing twice.
@@ -380,28 +361,6 @@ class TotalRate:
         total = sum(parts.values())
         found = [VarianceShare(source, name, float(part / total)) for (source, name), part in parts.items() if part > 0]
         return tuple(sorted(found, key=lambda each: -each.share))
-
-    def further_events(self, recorded: dict[str, int]) -> FurtherEvents | None:
-        """Return the number of further events of one scenario that would halve the width of the interval.
-
-        The spread of p over refits falls with 1 / sqrt(number of events). With m events behind a share b of the
-        variance, m' events leave 1 - b (1 - m / m') of it, which is a quarter at m' = m b / (b - 3/4).
-
-        Args:
-            recorded: Events that each scenario's base was fitted to, by its name; those not known are left out.
-
-        Returns:
-            The numbers for the scenario with the largest share; None where none has any, or where a rate that is not
-            determined adds its bound to the upper end.
-        """
-        if len(self.determined) < len(self.rates):
-            return None
-        first = next((each for each in self.shares if each.source == "base" and recorded.get(each.scenario)), None)
-        if first is None:
-            return None
-        events, left_over = recorded[first.scenario], first.share - 0.75
-        number = math.ceil(events * first.share / left_over - events) if left_over > 0 else None
-        return FurtherEvents(first.scenario, number, 3 * events)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -694,28 +653,3 @@ def calibration() -> Mapping[Event, EventCalibration]:
         )
         for event, found in content["events"].items()
     }
-
-
-def describe_human_contacts() -> str:
-    """Return the figures that stand beside a rate of collisions, per million km.
-
-    Example:
-        >>> describe_human_contacts()
-        'people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 crashes without tyre strikes (SHRP 2)'
-    """
-    return (
-        f"people: {CONTACTS_100CAR.per_million_km:.2g} contacts of all kinds, "
-        f"{REAR_END_CONTACTS_100CAR.per_million_km:.2g} into a vehicle ahead (100-Car), "
-        f"{CONTACTS_SHRP2.per_million_km:.2g} {CONTACTS_SHRP2.kind} (SHRP 2)"
-    )
-
-
-def summarise_human_contacts() -> str:
-    """Return the range of those figures in a few words, per million km.
-
-    Example:
-        >>> summarise_human_contacts()
-        'people 15 to 21 (contacts at any speed)'
-    """
-    low, high = sorted((CONTACTS_SHRP2.per_million_km, CONTACTS_100CAR.per_million_km))
-    return f"people {low:.2g} to {high:.2g} (contacts at any speed)"

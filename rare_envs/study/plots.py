@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -18,14 +18,15 @@ from PIL import Image, ImageDraw
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.envs import rendering
-from rare_envs.exposure import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR, RateInterval, TotalRate
+from rare_envs.exposure import HumanBenchmark, RateInterval, TotalRate
 from rare_envs.files import replace_file
 from rare_envs.plugins import EgoGone, reason_of
 from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
+from rare_envs.study.events import EventRate
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
-from rare_envs.study.text import format_rate, format_share, format_with_interval, name_scenario, name_source
+from rare_envs.study.text import EVENT_NOUNS, format_rate, format_with_interval
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 if TYPE_CHECKING:
@@ -264,59 +265,56 @@ FRACTION_BELOW = 0.1
 """Left end of the axis over the smallest number on it, where an interval reaches down to 0."""
 
 
-def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
-    """Draw a total and the rates of which it is the sum, and save it."""
-    level = f"{100 * total.confidence:g} %: "
-    unit, ends = " collisions per million km", total.interval_per_million_km
-    with saved_figure(path, 12, 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))) as figure:
-        left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-        title = f"ego {ego}: {format_with_interval(total.per_million_km, ends, unit, level)}"
-        figure.suptitle(title, fontsize=12, fontweight="bold")
-        draw_rates(left, total)
-        draw_shares(right, total)
-
-
-def draw_rates(axes: Axes, total: TotalRate) -> None:
-    """Draw the rate of each scenario and their sum, with intervals, and lines for people."""
-    rows: list[tuple[str, float, RateInterval]] = [
-        (name_scenario(rate.scenario), rate.per_million_km, rate.interval_per_million_km) for rate in total.rates
+def save_risk_plot(
+    path: Path, ego: str, total: TotalRate, events: Sequence[EventRate], people: HumanBenchmark | None
+) -> None:
+    """Draw the rates of events and their sum beside those of people, and save it."""
+    level, ends = f"{100 * total.confidence:g} %: ", total.interval_per_million_km
+    rows: list[tuple[str, float, RateInterval, HumanBenchmark | None]] = [
+        (_name_row(each), each.rate.per_million_km, each.rate.interval_per_million_km, each.people) for each in events
     ]
-    rows.append(("total", total.per_million_km, total.interval_per_million_km))
-    people = (CONTACTS_100CAR, REAR_END_CONTACTS_100CAR)
-    shown = [end for _, _, ends in rows for end in ends if end > 0]
-    start = FRACTION_BELOW * min(*shown, people[1].per_million_km)
-    for row, (name, rate, (low, high)) in enumerate(rows):
-        colour = HIT_COLOUR if name == "total" else LINE_COLOUR
-        if low > 0:
-            axes.plot([low, high], [row, row], color=colour, linewidth=3, alpha=0.5, solid_capstyle="butt")
-            axes.plot(rate, row, "o", color=colour)
-        else:  # an upper end alone: an arrow out of the axis, without a point
-            style = {"arrowstyle": "->", "color": colour, "linewidth": 2}
-            axes.annotate("", (start, row), (high, row), arrowprops=style)
-            axes.plot(high, row, "|", color=colour, markersize=12, markeredgewidth=2)
-            axes.annotate(f"below {format_rate(high)}", (high, row), (6, -3), textcoords="offset points", fontsize=8)
-    axes.set(xscale="log", xlim=(start, max(*shown, people[0].per_million_km) / FRACTION_BELOW))
-    for each, dashes in zip(people, ("--", ":"), strict=True):
-        axes.axvline(each.per_million_km, color="black", linewidth=1, linestyle=dashes, label=each.kind)
-    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
-    axes.set(ylim=(len(rows) + 0.4, -0.6), xlabel="collisions per million km")  # room for the legend below
-    axes.legend(title="people (100-Car)", loc="lower left", fontsize=8, frameon=False)
+    rows.append(("all of these", total.per_million_km, ends, people))
+    with saved_figure(path, 10, 2.2 + 0.8 * len(rows)) as figure:
+        said = format_with_interval(total.per_million_km, ends, " collisions per million km", level)
+        figure.suptitle(f"{ego}: {said}", fontsize=14, fontweight="bold")
+        draw_rates(figure.subplots(), rows)
 
 
-def draw_shares(axes: Axes, total: TotalRate) -> None:
-    """Draw the shares of the sources of the uncertainty as bars."""
-    shares = total.shares
-    of_what = "" if len(total.determined) == len(total.rates) else " of the determined part"
-    axes.set_title(f"sources of the uncertainty{of_what}\n(shares of the variance)", fontsize=10)
-    if not shares:
-        _write_message(axes, "not known: no rate has a lower end")
+def _name_row(each: EventRate) -> str:
+    """Return an event in words, and whether its rate is calibrated."""
+    name = EVENT_NOUNS.get(each.event, each.event)
+    return name if each.is_calibrated else f"{name}\n(uncalibrated)"
+
+
+def draw_rates(axes: Axes, rows: Sequence[tuple[str, float, RateInterval, HumanBenchmark | None]]) -> None:
+    """Draw rates with intervals, and below each that of people."""
+    human = [(each.per_million_km, each.interval_per_million_km) for *_, each in rows if each is not None]
+    shown = [end for ends in (*(row[2] for row in rows), *(ends for _, ends in human)) for end in ends if end > 0]
+    start = FRACTION_BELOW * min(shown)
+    for row, (_, rate, ends, people) in enumerate(rows):
+        _draw_interval(axes, row - 0.15, rate, ends, HIT_COLOUR if row == len(rows) - 1 else LINE_COLOUR, start)
+        if people is not None:
+            beside = people.per_million_km, people.interval_per_million_km
+            _draw_interval(axes, row + 0.15, *beside, ORDINARY_COLOUR, start)
+    axes.plot([], [], "o-", color=LINE_COLOUR, linewidth=4, label="the ego")
+    axes.plot([], [], "o-", color=ORDINARY_COLOUR, linewidth=4, label="people in the same events (100-Car)")
+    axes.set(xscale="log", xlim=(start, max(shown) / FRACTION_BELOW), ylim=(len(rows) - 0.4, -0.6))
+    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=12)
+    axes.set_xlabel("collisions per million km", fontsize=12)
+    axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.3)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=2, fontsize=11, frameon=False)
+
+
+def _draw_interval(axes: Axes, y: float, rate: float, ends: RateInterval, colour: str, start: float) -> None:
+    """Draw a rate with its interval; an upper end alone as an arrow out of the axis, without a point."""
+    low, high = ends
+    if low > 0:
+        axes.plot([low, high], [y, y], color=colour, linewidth=4, alpha=0.5, solid_capstyle="butt")
+        axes.plot(rate, y, "o", color=colour, markersize=8)
         return
-    axes.barh(range(len(shares)), [100 * each.share for each in shares], color=LINE_COLOUR)
-    for row, each in enumerate(shares):
-        axes.text(100 * each.share + 1, row, format_share(each.share), va="center")
-    axes.set_yticks(range(len(shares)), [name_source(each) for each in shares])
-    axes.set(ylim=(len(shares) - 0.4, -0.6), xlim=(0, 115), xlabel="%")
-    axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.4)
+    axes.annotate("", (start, y), (high, y), arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 2})
+    axes.plot(high, y, "|", color=colour, markersize=14, markeredgewidth=2)
+    axes.annotate(f"below {format_rate(high)}", (high, y), (6, -4), textcoords="offset points", fontsize=11)
 
 
 CURVES_HEIGHT = 144

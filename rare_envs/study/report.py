@@ -15,11 +15,12 @@ import samplers
 from agents.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionProbability, CollisionRate, explain_no_frequency, read_source
+from rare_envs.exposure import CollisionProbability, CollisionRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
+from rare_envs.study.events import COUNTED, EventRate, find_calibration, split_by_stratum
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
@@ -272,6 +273,31 @@ class Report:
         return self._rate_of(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
 
     @cached_property
+    def events(self) -> tuple[EventRate, ...]:
+        """The rate of each kind of event that the scenario stands for; empty where `no_rate` says why there is none."""
+        if self.rate is None:
+            return ()
+        base, env_id = self.study.problem.base, self.study.question.env_id
+        parts = split_by_stratum(self.estimate, base)
+        whole = {part.name: part.value / self.estimate.p for part in parts if self.estimate.p > 0}
+        found = [
+            (part.name, part.share, self._rate_of(part.value, part.cov, part.interval, part.base)) for part in parts
+        ]
+        if not parts or any(part.name not in COUNTED for part in parts):
+            found = [(self.rate.scenario, 1.0, self.rate)]
+        return tuple(
+            EventRate(
+                event=name,
+                share=share,
+                rate=rate,
+                parts=whole if len(found) == 1 else {},
+                calibration=find_calibration(name, env_id, base),
+            )
+            for name, share, rate in found
+            if rate is not None
+        )
+
+    @cached_property
     def injury_rate(self) -> CollisionRate | None:
         """Serious injuries (MAIS 3 or more) per hour and per km; None where there is no rate, or no collision."""
         severity = self.kinds.severity
@@ -357,9 +383,8 @@ class Report:
             "repeatability": None if self.repeatability is None else self.repeatability._asdict(),
             "faults": [{"parameters": self._parameters(one.x), "reason": one.reason} for one in self.faults[:top]],
             "units": dict(zip(space.names, space.units, strict=True)),
-            "rate": None
-            if self.rate is None
-            else {**self.rate.to_dict(), "people": [each.to_dict() for each in HUMAN_BENCHMARKS]},
+            "rate": convert(self.rate),
+            "events": [each.to_dict() for each in self.events],
             "injury_rate": convert(self.injury_rate),
             "no_rate": self.no_rate,
             "other_bases": [

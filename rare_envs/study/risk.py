@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -12,18 +12,20 @@ from typing import Any
 
 import numpy as np
 
+import agents
 from rare_envs import exposure
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
-from rare_envs.scenarios.registry import env_id_of, scenario_named
+from rare_envs.scenarios.registry import env_id_of, find_scenario, scenario_named
 from rare_envs.startup import __version__
 from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer
 from rare_envs.study.evaluate import run, run_into
+from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
-from rare_envs.study.question import Study, prepare
+from rare_envs.study.question import Study, build_problem, prepare
 from rare_envs.study.report import Report, find_frequency
 from rare_envs.study.writing import check_no_results
 
@@ -109,24 +111,21 @@ class ScenarioRisk:
         scale = self.rate.frequency.per_km * exposure.MILLION_KM
         return {kind: scale * share.p for kind, share in self.report.kinds.shares.items()}
 
-    def describe(self) -> str:
-        """Return the line of the table: frequency x p = rate, its interval, and the events behind it."""
-        rate, study = self.rate, self.report.study
+    def describe_traffic(self) -> str:
+        """Return the base, the events behind it, and the rates under those of other sites."""
+        study = self.report.study
         behind = "events not known" if study.fitted is None else study.fitted.fitted_to
         version = study.question.env_id.rpartition("/")[2]  # whose bases may have the same names
         factors = {name: factor for name, factor in self.site_factors.items() if factor > 0}
         sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
-        per_km = text.format_with_interval(rate.per_million_km, rate.interval_per_million_km, " ")
-        return (
-            f"{text.name_scenario(self.name):<13} {text.format_rate(rate.frequency.per_km)} per km x "
-            f"{rate.probability.p:.1e} = {per_km}   {behind} ({study.base_name} of {version}){sites}"
-        )
+        return f"{study.base_name} of {version} ({behind}){sites}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         fitted = self.report.study.fitted
         return {
             **self.rate.to_dict(),
+            "by_event": [each.to_dict() for each in self.report.events],
             "base": self.report.study.base_name,
             "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
@@ -143,6 +142,8 @@ class Risk:
     ego: str
     """The ego, as it was named."""
     scenarios: tuple[ScenarioRisk, ...]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Why the ego does not fit other scenarios, by name."""
 
     @cached_property
     def total(self) -> exposure.TotalRate:
@@ -165,16 +166,21 @@ class Risk:
         return dict(sorted(sums.items(), key=lambda kind: -kind[1]))
 
     @property
-    def recorded_events(self) -> dict[str, int]:
-        """Recorded events behind each base distribution, of its first part, by scenario."""
-        fitted = {each.name: each.report.study.fitted for each in self.scenarios}
-        return {name: base.events.used[0] for name, base in fitted.items() if base is not None}
+    def events(self) -> tuple[EventRate, ...]:
+        """Rates by kind of event, each beside people and the human driver model in it."""
+        return tuple(each for scenario in self.scenarios for each in scenario.report.events)
+
+    @property
+    def people(self) -> exposure.HumanBenchmark | None:
+        """Contacts of people in the same events together; None where those of one kind were not counted."""
+        return sum_people(self.events)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Doubts about p and about the error of its base distribution, by scenario."""
         named = ((text.name_scenario(each.name), each.report.warnings) for each in self.scenarios)
-        return tuple(f"{name}: {warning}" for name, warnings in named for warning in warnings)
+        left_out = (f"{text.name_scenario(name)} is left out: {why}" for name, why in self.left_out.items())
+        return (*left_out, *(f"{name}: {warning}" for name, warnings in named for warning in warnings))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -182,36 +188,37 @@ class Risk:
         return tuple(f"{text.name_scenario(each.name)}: {note}" for each in self.scenarios for note in each.notes)
 
     def __str__(self) -> str:
-        """Return the table, for people."""
-        total, kinds = self.total, self.kinds
+        """Return the table, for people: the total first, a line for each event, warnings last."""
+        total, kinds, people = self.total, self.kinds, self.people
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
         per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
-        per_hour = text.format_with_interval(total.per_hour, total.interval_per_hour, " ", level)
+        beside = "" if people is None else f"; people in the same events {text.describe_people(people)}"
         lines = [
-            f"collisions per million km  {per_km}   {exposure.describe_human_contacts()}",
-            *(f"  {each.describe()}" for each in self.scenarios),
-            f"  per hour      {per_hour}",
+            f"{self.ego}: collisions per million km {per_km}{beside}",
+            *(f"  {line}" for line in text.tabulate_events(self.events)),
         ]
         if whole > 0:
             parts = (f"{kind} {text.format_rate(r)} ({text.format_share(r / whole)})" for kind, r in kinds.items())
-            lines.append(f"  by kind       {', '.join(parts)}")
-        lines += [] if self.injuries is None else [f"  {text.describe_injuries(self.injuries)}"]
-        lines += filter(None, [text.describe_uncertainty(total, self.recorded_events)])
+            lines.append(f"  by kind      {', '.join(parts)}")
+        lines += [] if self.injuries is None else [f"  injuries     {text.describe_injuries(self.injuries)}"]
+        lines += [f"  uncertainty  {said}" for said in filter(None, [text.describe_uncertainty(total)])]
+        lines.append(f"  traffic      {'; '.join(each.describe_traffic() for each in self.scenarios)}")
+        lines += [f"  human model  {text.describe_columns(self.events)}"]
         return "\n".join(
-            [*lines, *(f"warning: {each}" for each in self.warnings), *(f"note: {each}" for each in self.notes)]
+            [*lines, *(f"note: {each}" for each in self.notes), *(f"warning: {each}" for each in self.warnings)]
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        needed = self.total.further_events(self.recorded_events)
         return {
             "ego": self.ego,
             **self.total.to_dict(),
             "scenarios": {each.name: each.to_dict() for each in self.scenarios},
             "kinds_per_million_km": self.kinds,
             "injuries": None if self.injuries is None else self.injuries.to_dict(),
-            "further_events": None if needed is None else needed._asdict(),
-            "people": [benchmark.to_dict() for benchmark in exposure.HUMAN_BENCHMARKS],
+            "events": [each.to_dict() for each in self.events],
+            "people": None if self.people is None else self.people.to_dict(),
+            "left_out": dict(self.left_out),
             "doubtful": bool(self.warnings),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
@@ -219,8 +226,8 @@ class Risk:
         }
 
     def save_plot(self, path: str | PathLike[str]) -> None:
-        """Draw the rates with their intervals and what the uncertainty comes from, and save it as a .png."""
-        save_risk_plot(Path(path), self.ego, self.total)
+        """Draw the rates by event with their intervals beside those of people, and save them as a .png."""
+        save_risk_plot(Path(path), self.ego, self.total, self.events, self.people)
 
 
 def risk(
@@ -238,7 +245,8 @@ def risk(
 
     Each scenario's p is multiplied by the frequency of its events, and the products are added. The interval holds the
     errors of the counted events, of the fitted base distributions and of the simulations; with several `sites` also
-    the spread between them. All holds for an ego that takes over at the moment of each event.
+    the spread between them. All holds for an ego that takes over at the moment of each event. A policy whose
+    observations or actions do not fit one of the scenarios is evaluated in the others, with a warning.
 
     Args:
         ego: Its name, file or address, as for `agents.load_ego`; or an object, as for `DrivingProblem`.
@@ -274,20 +282,25 @@ def risk(
             Question(env_id=env_id_of(name), base=base, **asked)
             for name, (base, _) in zip(scenarios, chosen, strict=True)
         ]
+    left_out = _find_misfits(questions, None if named else ego)
     with as_bad_input(ValueError):
-        studies = [prepare(question, None if named else ego) for question in questions]
+        fitting = [each for each in zip(questions, chosen, scenarios, strict=True) if each[2] not in left_out]
+        if not fitting:
+            names = ", ".join(map(text.name_scenario, scenarios))
+            raise ValueError(f"The ego fits none of the scenarios {names}. {next(iter(left_out.values()))}")
+        studies = [prepare(question, None if named else ego) for question, _, _ in fitting]
         for study in studies:
             find_frequency(study)
-    for name in scenarios if folder is not None and not force else ():  # all of them, before the first one is run
+    for _, _, name in fitting if folder is not None and not force else ():  # all of them, before the first one is run
         check_no_results(Path(folder or "", name))
     done: list[ScenarioRisk] = []
-    for study, (_, notes) in zip(studies, chosen, strict=True):
+    for study, (_, (_, notes), _) in zip(studies, fitting, strict=True):
         try:
             done.append(_evaluate(study, notes, sites[1:], folder, progress, force))
         except RunInterrupted as error:
-            known = "; ".join(" ".join(one.describe().split()) for one in done)
+            known = "; ".join(f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done)
             raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
-    found = Risk(ego=ego_name, scenarios=tuple(done))
+    found = Risk(ego=ego_name, scenarios=tuple(done), left_out=left_out)
     if folder is not None:
         replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
         found.save_plot(folder / "risk.png")
@@ -314,6 +327,21 @@ def _check_scenarios(names: Sequence[str], sites: Sequence[str], bases: Mapping[
             )
         hint = did_you_mean(site, known)
         raise ValueError(f"No base of {', '.join(names)} is of a site {site!r}{hint}; there are {there}.")
+
+
+def _find_misfits(questions: Sequence[Question], ego: Any) -> dict[str, str]:
+    """Return why an ego, or that of the questions, does not fit scenarios by its observations or actions, by name."""
+    found = {}
+    with as_bad_input(ValueError, OSError):
+        first = questions[0]
+        if ego is None:
+            ego = agents.load_ego(first.ego, algo=first.algo, trust=first.trust, stats=first.stats)
+        for question in questions:
+            try:
+                build_problem(replace(question, base=None, ensemble=False), ego)
+            except ValueError as error:
+                found[find_scenario(question.env_id).name] = str(error)
+    return found
 
 
 def _evaluate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from rare_envs import exposure
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
 from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
+from rare_envs.study.events import BRACKET, MODEL, EventRate
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.replay import name_parties
 from rare_envs.study.report import Report
@@ -22,8 +23,14 @@ from samplers.output import indent_lines
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
 
-EVENT_NOUNS = {"cut_in": "cut-ins", "hard_brake": "brakings", "car_following": "new leaders"}
-"""Events of the scenarios, in the plural."""
+EVENT_NOUNS = {
+    "cut_in": "cut-ins",
+    "stop": "stops of the lead",
+    "slowing": "slowings of the lead",
+    "hard_brake": "brakings",
+    "car_following": "new leaders",
+}
+"""Events, and those of scenarios, in the plural."""
 SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulation"}
 PART_NOUNS = {"base": "base distribution", "site": "difference between sites", **SOURCE_NOUNS}
 LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
@@ -76,7 +83,63 @@ def describe_injuries(rate: exposure.CollisionRate | exposure.TotalRate) -> str:
     )
 
 
-def describe_uncertainty(total: exposure.TotalRate, recorded: dict[str, int]) -> str:
+def describe_people(people: exposure.HumanBenchmark | None) -> str:
+    """Return people's contacts per million km with their interval."""
+    if people is None:
+        return "not counted"
+    return format_with_interval(people.per_million_km, people.interval_per_million_km)
+
+
+def describe_model(each: EventRate) -> str:
+    """Return what the human driver model and its bracket score per million km, and by what factor they miss people."""
+    scores = [found[0] for found in map(each.model_interval, (MODEL, BRACKET)) if found is not None]
+    if each.factor is None:
+        return "uncalibrated"
+    words = " to ".join(dict.fromkeys(format_alike(*scores)))
+    if each.is_calibrated:
+        return words
+    factor, side = (each.factor, "above") if each.factor > 1 else (1 / each.factor, "below")
+    return f"{words}: uncalibrated, {factor:.2g} times {side} people"
+
+
+def describe_parts(shares: Mapping[str, float]) -> str:
+    """Return the shares of strata in a rate or in p, the largest first: "of which unseen 92 %, looked 8 %"."""
+    ordered = sorted(shares.items(), key=lambda part: -part[1])
+    return f"of which {', '.join(f'{name} {format_share(share)}' for name, share in ordered)}" if shares else ""
+
+
+def tabulate(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows of words as lines with columns as wide as their longest word."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(f"{word:<{width}}" for word, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def tabulate_events(events: Sequence[EventRate]) -> list[str]:
+    """Return a table of the rates of events per million km, each beside people and the human driver model in it."""
+    rows = [("", "per km", "per event", "per million km", "people in them", "human model")]
+    for each in events:
+        rate = each.rate
+        p = rate.per_million_km / exposure.MILLION_KM / rate.frequency.per_km / each.share
+        numbers = format_rate(rate.frequency.per_km * each.share), f"{p:.1e}"
+        ego = format_with_interval(rate.per_million_km, rate.interval_per_million_km)
+        name = EVENT_NOUNS.get(each.event, each.event)
+        rows.append((name, *numbers, ego, describe_people(each.people), describe_model(each)))
+    head, *lines = tabulate(rows)
+    parts = ([f"  {describe_parts(each.parts)}"] if each.parts else [] for each in events)
+    return [head, *(line for row, more in zip(lines, parts, strict=True) for line in (row, *more))]
+
+
+def describe_columns(events: Sequence[EventRate]) -> str:
+    """Return what the columns of people and of the human driver model are."""
+    provisional = any(each.calibration is not None and each.calibration.provisional for each in events)
+    words = (
+        f"{MODEL} to {BRACKET} in the same events; within a factor {exposure.CALIBRATED_WITHIN:g} of people's interval "
+        "a rate is calibrated (people: 100-Car, contacts at any speed)"
+    )
+    return f"{words}; its figures are provisional" if provisional else words
+
+
+def describe_uncertainty(total: exposure.TotalRate) -> str:
     """Return what the uncertainty of a total comes from; empty if it is not known."""
     parts = []
     if total.shares:
@@ -84,14 +147,6 @@ def describe_uncertainty(total: exposure.TotalRate, recorded: dict[str, int]) ->
         of_what = "the uncertainty" if whole else "the uncertainty of the determined part"
         sources = ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in total.shares)
         parts.append(f"{of_what} is {sources}")
-    needed = total.further_events(recorded) if total.shares else None
-    if needed is not None:
-        events = EVENT_NOUNS.get(needed.scenario, "events")
-        what = f"about {format_rate(needed.number or 0.0)} further recorded {events} would halve it"
-        if needed.number is None:
-            own = f"about {format_rate(needed.own)} would halve their own part"
-            what = f"further {events} alone would not halve it; {own}"
-        parts.append(f"{what} (a spread falls with 1 / sqrt(events))")
     for rate in (each for each in total.rates if not each.determined):
         high = format_rate(rate.interval_per_million_km[1])
         parts.append(f"{name_scenario(rate.scenario)} is not determined, and adds {high} to the upper end")
@@ -233,15 +288,14 @@ def _list_rates(report: Report, details: bool) -> Iterator[Row]:
         yield "collisions", report.no_rate
         return
     per_km = format_with_interval(rate.per_million_km, rate.interval_per_million_km, unit)
+    yield "collisions", per_km
+    yield from (("", line) for line in tabulate_events(report.events))
     if details:
-        per_hour = format_with_interval(rate.per_hour, rate.interval_per_hour, " per hour")
-        yield "collisions", f"{per_km}, {per_hour}; {exposure.describe_human_contacts()}"
+        yield "", format_with_interval(rate.per_hour, rate.interval_per_hour, " per hour")
         shares = sorted(rate.shares.items(), key=lambda part: -part[1])
         parts = ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in shares if share > 0)
         events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
         yield "", f"from {events}{f'; the uncertainty is {parts}' if parts else ''}"
-    else:
-        yield "collisions", f"{per_km}; {exposure.summarise_human_contacts()}"
     if injuries is not None and details:
         yield "", describe_injuries(injuries)
     elif injuries is not None:

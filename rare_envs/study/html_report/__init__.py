@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from rare_envs.envs.rendering import CRASH_COLOUR, FRAME_WIDTH, ROLE_COLOURS
-from rare_envs.exposure import describe_human_contacts
 from rare_envs.files import replace_text
 from rare_envs.plugins import EgoGone, one_line, reason_of
 from rare_envs.problem import DrivingProblem
@@ -258,7 +257,8 @@ def render_page(
         remarks=[each for each in noted if each not in own],
         end=describe_outcome(str(result.get("status")), own),
         no_gain=text.explain_no_gain(float(result["p"])),
-        people=describe_human_contacts(),
+        nouns=text.EVENT_NOUNS,
+        parts=text.describe_parts,
         sized_by_budget=SIZED_BY_BUDGET,
         figures={name: figure.to_svg() for name, figure in figures.items()},
         passes_levels=drawings.passes_levels(result),

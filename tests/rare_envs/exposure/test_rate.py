@@ -165,22 +165,6 @@ def test_shares_of_the_variance_by_hand() -> None:
     assert total.shares[0].scenario == "cut_in"
 
 
-def test_further_events_halve_the_width() -> None:
-    """A base alone: 38 events with s fall to s / 2 at 4 x 38; with other parts more are needed, or none suffice."""
-    alone = TotalRate((rate(3e-4, 0.0, SURE, spread=1.4),))
-    needed = alone.further_events({"cut_in": 38})
-    assert needed is not None
-    assert (needed.scenario, needed.number, needed.own) == ("cut_in", pytest.approx(3 * 38, abs=1), 3 * 38)
-    mixed = TotalRate((rate(3e-4, 0.0, SURE, spread=1.4, site_log_sd=0.6),))
-    more = mixed.further_events({"cut_in": 38})
-    assert more is not None and more.number is not None
-    before, after = sum(mixed.rates[0].log_variance.values()), 1.96 * 38 / (38 + more.number) + 0.36
-    assert math.sqrt(after / before) == pytest.approx(0.5, abs=0.002)
-    hopeless = TotalRate((rate(3e-4, 0.0, SURE, spread=1.4, site_log_sd=1.4),)).further_events({"cut_in": 38})
-    assert hopeless is not None and hopeless.number is None
-    assert alone.further_events({}) is None
-
-
 TABLE = {
     ("100-Car", "contacts of all kinds"): (21, 16, 27, 1.6e-3),
     ("100-Car", "near-crashes"): (236, 220, 254, 1.8e-2),

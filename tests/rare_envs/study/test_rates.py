@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from scipy import stats
 
 import rare_envs
+import samplers
+from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.exposure import CollisionProbability, CollisionRate, ModelCount, calibration
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.simulation.observation import observation_space
 from rare_envs.study import BadInput, Question, prepare, run
+from rare_envs.study.events import EventRate, split_by_stratum, sum_people
 from rare_envs.study.report import describe_left_out, find_frequency
 from rare_envs.study.risk import choose_base, compare_sites
-from rare_envs.study.text import format_rate, format_with_interval
+from rare_envs.study.text import describe_model, format_rate, format_with_interval, tabulate_events
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
 
 FEW = {"method": "mc", "max_sim": 400}
@@ -90,7 +97,7 @@ def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> Non
     low, high = found.total.interval_per_million_km
     assert 0 < low < expected < high
     assert sum(found.kinds.values()) == pytest.approx(expected)
-    assert found.recorded_events == {"cut_in": 38, "hard_brake": 42} and found.notes == ()
+    assert found.notes == ()
     assert "38 + 15 events of 17 scenes" in str(found)
 
 
@@ -171,3 +178,99 @@ def test_a_rate_has_two_digits_and_with_its_interval_one_form() -> None:
         (2e-7, (0.0, 1700.0), "2.0e-07 (below 1.7e+03)"),
     ):
         assert format_with_interval(value, interval) == text
+
+
+class Halves(samplers.StandardNormal):
+    """N(0, 1) as its two halves, with refits N(m, 1), which have shares of their own."""
+
+    family, clusters, fitted_to = "normal", 40, "40 events of 40 scenes"
+
+    def __init__(self, mean: float = 0.0, refits: tuple[float, ...] = ()) -> None:
+        super().__init__(1)
+        self.mean, self.refits = mean, [Halves(each) for each in refits]
+        below = stats.norm.cdf(0.0, mean)
+        self.strata = [
+            SimpleNamespace(name=name, share=share, base=SimpleNamespace(log_prob=partial(self._half, side, share)))
+            for name, side, share in (("below", -1, below), ("above", 1, 1 - below))
+        ]
+
+    def _half(self, side: int, share: float, x: np.ndarray) -> np.ndarray:
+        return np.where(np.sign(x[:, 0]) == side, self.log_prob(x) - np.log(share), -np.inf)
+
+    def log_prob(self, x: np.ndarray) -> np.ndarray:
+        return stats.norm.logpdf(x[:, 0], self.mean)
+
+
+def test_the_parts_of_p_are_those_of_its_strata_with_the_error_of_their_shares() -> None:
+    """P[x > 1] + P[x < -2] under N(0, 1), and under N(m, 1): by the normal distribution, within five deviations."""
+    base, n = Halves(refits=(-0.1, 0.0, 0.1)), 40_000
+    problem = SimpleNamespace(dim=1, base=base, evaluate=lambda x: np.minimum(1.0 - x[:, 0], x[:, 0] + 2.0))
+    estimate = samplers.estimate(problem, "mc", seed=0, max_sim=n)
+    parts = [SimpleNamespace(name=each.name, share=each.share, p=0.1, cov=0.1, interval=(0, 1)) for each in base.strata]
+    object.__setattr__(estimate, "parts", parts)
+    below, above = split_by_stratum(estimate, base)
+    for part, of in (
+        (below, lambda mean: stats.norm.cdf(-2.0 - mean)),
+        (above, lambda mean: stats.norm.sf(1.0 - mean)),
+    ):
+        for found, mean in zip(part.base.value_refits, (-0.1, 0.0, 0.1), strict=True):
+            assert found == pytest.approx(of(mean), abs=6 * math.sqrt(of(mean) / n))
+    assert (below.value, above.value) == (pytest.approx(0.05), pytest.approx(0.05))
+
+
+def test_each_event_stands_beside_people_in_it() -> None:
+    """1 + 13 + 0 contacts in 3.2187e6 km (100-Car)."""
+    rate = CollisionRate(
+        scenario="hard_brake",
+        probability=CollisionProbability(p=1e-4, cov=0.1, upper=2e-4),
+        frequency=EventFrequency(count=268, hours=5.64, km=218.0, definition="brakings", source="US 101"),
+    )
+    events = [
+        EventRate(event=name, rate=rate, share=share, parts={}, calibration=calibration().get(name))
+        for name, share in (("cut_in", 1.0), ("stop", 0.15), ("slowing", 0.85))
+    ]
+    people = sum_people(events)
+    assert people.count == 14 and people.per_million_km == pytest.approx(14 / 3.21869)
+    assert sum_people([*events, replace(events[0], event="car_following")]) is None
+    lines = tabulate_events([replace(events[0], parts={"looked": 0.08, "unseen": 0.92}), *events[1:]])
+    assert "0.31 (0.0079 to 1.7)" in lines[1] and lines[2] == "  of which unseen 92 %, looked 8 %"
+    assert "4.0 (2.2 to 6.9)" in lines[3] and "uncalibrated" not in lines[3]
+
+
+def test_a_rate_is_uncalibrated_where_the_model_misses_people_by_more_than_a_factor_of_three() -> None:
+    """12 times the upper end of people's interval in stops is 12 x 1.62e-5 x their frequency."""
+    known = calibration()["stop"]
+    upper = known.people("contacts")[1][1]
+    for factor, calibrated in ((2.9, True), (12.0, False)):
+        drivers = {
+            name: {"contacts": ModelCount(factor * upper, 0.0, 1.0)} for name in ("human", "human:no-headway-rule")
+        }
+        found = EventRate(event="stop", rate=None, share=1.0, parts={}, calibration=replace(known, drivers=drivers))
+        assert found.is_calibrated is calibrated
+        assert ("uncalibrated, 12 times above people" in describe_model(found)) is not calibrated
+
+
+class Policy:
+    """Keeps its speed; declares the features of two or three vehicles."""
+
+    observation_space = observation_space(3, "features")
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2)), None
+
+
+def test_the_scenarios_that_a_policy_fits_are_run(bases: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """With hard brake among five vehicles, for which the policy has not enough inputs."""
+    found = rare_envs.risk(Policy(), bases=bases, **FEW)
+    assert not found.left_out and len(found.scenarios) == 2
+    crowded = replace(HARD_BRAKE, vehicle_names=("ego", "lead", "a", "b", "c"), labels=())
+    monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", crowded)
+    found = rare_envs.risk(Policy(), bases=bases, **FEW)
+    assert [each.name for each in found.scenarios] == ["cut_in"] and list(found.left_out) == ["hard_brake"]
+    [warning] = [each for each in found.warnings if "left out" in each]
+    assert warning.startswith("hard brake is left out: The ego expects observations") and "(19,)" in warning
+    stranger = Policy()
+    stranger.observation_space = spaces.Box(-1.0, 1.0, (101,))
+    with pytest.raises(BadInput, match=r"fits none of the scenarios cut-in, hard brake\. .*101") as refused:
+        rare_envs.risk(stranger, bases=bases, **FEW)
+    assert "\n" not in str(refused.value)

@@ -242,7 +242,7 @@ def test_the_table_and_the_folder(cli: Cli, here: Path) -> None:
     bases = [word for name in names for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")]
     result = cli("risk", "idm", *bases, *FEW, "--out", here / "out")
     assert result.exit_code == 0, result.output
-    assert result.stdout.startswith("collisions per million km  ")
+    assert result.stdout.startswith("idm: collisions per million km ")
     assert result.stdout.endswith(f"Wrote {here / 'out'}.\n")
     assert (here / "out" / "risk.png").exists()
 
@@ -250,9 +250,8 @@ def test_the_table_and_the_folder(cli: Cli, here: Path) -> None:
 def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
     short = " ".join(cli(*BRAKE, "--base", base).stdout.split())
-    assert "per million km (" in short and "; people 15 to 21 (contacts at any speed) " in short
+    assert "per million km (" in short and "per event per million km people in them human model brakings 0.19" in short
     text = " ".join(cli(*BRAKE, "--base", base, "--details").stdout.split())
-    assert "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car)," in text
     assert "from 0.19 brakings per km; the uncertainty is" in text
     data = json.loads(cli(*BRAKE, "--base", base, "--json").stdout)
     assert data["rate"]["per_hour"] == pytest.approx(42 / 5.64 * data["p"])

@@ -1,0 +1,163 @@
+"""Events: the kinds of event that a scenario stands for, each with its rate beside that of people in the same event.
+
+The strata of a base distribution are parts of p (`samplers.Estimate.parts`). Those that bear the name of an event of
+which people's contacts were counted, such as the brakings to a standstill among all brakings, are events of their own;
+the others are parts of the scenario's one event, such as the cutters who do not look. The rate of a part is the
+frequency of the scenario's events times its share times its p, and its interval has the error of the share, as each
+refit of the base has shares of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, get_args
+
+import numpy as np
+
+import samplers
+from rare_envs.exposure import (
+    MILLION_KM,
+    CollisionRate,
+    Event,
+    EventCalibration,
+    HumanBenchmark,
+    RateInterval,
+    calibration,
+    people_in,
+)
+from samplers import analysis
+from samplers.analysis.base_error import BaseUncertainty
+from samplers.problem import FloatArray
+from samplers.sample import Interval
+
+MODEL, BRACKET = "human", "human:no-headway-rule"
+"""The human driver model, and the one that brackets people together with it."""
+COUNTED: tuple[str, ...] = get_args(Event)
+"""Events of which people's contacts were counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartValue:
+    """Share times p of a stratum, with its errors."""
+
+    name: str
+    share: float
+    value: float
+    cov: float
+    interval: Interval
+    """Sampling interval."""
+    base: BaseUncertainty | None
+    """What the events behind the base leave open, the share included; None where it is not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventRate:
+    """Collisions of an ego in one kind of event."""
+
+    event: str
+    """One of `COUNTED`, or the name of a scenario."""
+    rate: CollisionRate
+    share: float
+    """Share of the scenario's events that are of this kind."""
+    parts: Mapping[str, float]
+    """Shares of the rate by stratum; empty where there is one stratum, or nothing failed."""
+    calibration: EventCalibration | None
+    """The human driver model in this event; None where nobody has measured it in this scenario."""
+
+    @property
+    def people(self) -> HumanBenchmark | None:
+        """Contacts of people in the same event; None where nobody has counted them."""
+        return people_in(self.event).contacts if self.event in COUNTED else None  # type: ignore[arg-type]
+
+    @property
+    def factor(self) -> float | None:
+        """Factor by which the human driver model misses people's interval; None where it is not known."""
+        return None if self.calibration is None else self.calibration.factor("contacts", MODEL)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the human driver model has contacts within a factor `CALIBRATED_WITHIN` of people's interval."""
+        return self.calibration is not None and self.calibration.is_calibrated
+
+    def model_interval(self, driver: str = MODEL) -> tuple[float, RateInterval] | None:
+        """Return contacts per million km of a human driver model, and their interval."""
+        if self.calibration is None:
+            return None
+        scale, count = MILLION_KM * self.calibration.per_km, self.calibration.drivers[driver]["contacts"]
+        return scale * count.p, (scale * count.low, scale * count.high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        models = {name: self.model_interval(name) for name in (MODEL, BRACKET)}
+        return {
+            "event": self.event,
+            "share_of_events": self.share,
+            **self.rate.to_dict(),
+            "parts": dict(self.parts),
+            "people": None if self.people is None else self.people.to_dict(),
+            "calibrated": self.is_calibrated,
+            "calibration": None
+            if self.calibration is None
+            else {
+                "base": self.calibration.base,
+                "provisional": self.calibration.provisional,
+                "factor": self.factor,
+                "per_million_km": {
+                    name: {"value": found[0], "interval": list(found[1])} for name, found in models.items() if found
+                },
+            },
+        }
+
+
+def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
+    """Return people's contacts in several kinds of event together; None where one of them was not counted."""
+    counted = [each.people for each in events]
+    known = [each for each in counted if each is not None]
+    if not known or len(known) < len(counted):
+        return None
+    kinds = ", ".join(each.kind for each in known)
+    return replace(known[0], count=sum(each.count for each in known), kind=kinds, words="sum of the kinds of event")
+
+
+def find_calibration(event: str, env_id: str, base: Any) -> EventCalibration | None:
+    """Return the calibration of an event, where the environment and the base are of the kind that was calibrated.
+
+    These are the newest version of the scenario with strata in its base, as the scripts of earlier ones and the test
+    distributions have drivers as there are none.
+    """
+    from rare_envs.scenarios.registry import env_id_of, find_scenario
+
+    newest = env_id_of(find_scenario(env_id).name) == env_id.rpartition(":")[2]
+    return calibration().get(event) if newest and list_strata(base) else None  # type: ignore[call-overload]
+
+
+def list_strata(base: Any) -> tuple[Any, ...]:
+    """Return the strata of a base distribution, each with `name`, `share` and `base`; none where it has but one."""
+    found = tuple(getattr(base, "strata", None) or ())
+    return found if len(found) > 1 else ()
+
+
+def stratum_of(strata: Sequence[Any], x: FloatArray) -> FloatArray:
+    """Return the number of the stratum of each point x (n, d), shape (n,)."""
+    found: FloatArray = np.argmax([np.log(each.share) + each.base.log_prob(x) for each in strata], axis=0)
+    return found
+
+
+def split_by_stratum(estimate: samplers.Estimate, base: Any) -> tuple[PartValue, ...]:
+    """Return share times p of each stratum of a base distribution, from the estimate of the sum."""
+    strata, found = list_strata(base), []
+    if not strata:
+        return ()
+    failures = analysis.weigh_failures(estimate)
+    which = stratum_of(strata, failures.x) if len(failures.x) else np.empty(0)
+    for number, part in enumerate(getattr(estimate, "parts", ())):
+        low, high = part.interval
+        value, cov, uncertainty = part.share * part.p, part.cov, None
+        here = (which == number).astype(np.float64)
+        if here.any():
+            own = analysis.expect_over_failures(failures, here, estimate.confidence)
+            uncertainty = analysis.expect_under_refits(estimate, failures, here, own)
+        ends = (part.share * low, part.share * high)
+        found.append(PartValue(name=part.name, share=part.share, value=value, cov=cov, interval=ends, base=uncertainty))
+    return tuple(found)
