@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import math
 import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
@@ -192,8 +193,9 @@ class Question:
     max_p: float | None = arg(
         None, "Limit of p: the exit code is 0 if it passes, 4 if it fails, 5 if that is undecided."
     )
-    gate_confidence: float = arg(0.95, "One-sided, of the comparison with --max-p.", option="confidence")
-    given_base: bool = arg(False, "Compare with --max-p as if the base distribution were the true one.")
+    max_rate: float | None = arg(None, "Limit of the collisions per million km, in place of --max-p; exit codes alike.")
+    gate_confidence: float = arg(0.95, "One-sided, of the comparison with the limit.", option="confidence")
+    given_base: bool = arg(False, "Compare with the limit as if the base distribution were the true one.")
 
     def __post_init__(self) -> None:
         """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""
@@ -204,14 +206,23 @@ class Question:
             object.__setattr__(self, "action", self.action or layout["action"])
 
     @property
+    def has_limit(self) -> bool:
+        """Whether the answer is compared with a limit."""
+        return self.max_p is not None or self.max_rate is not None
+
+    @property
     def run_arguments(self) -> RunArguments:
         """The arguments of `samplers.estimate`."""
         from samplers.run import RunArguments
 
         confidence = RunArguments.confidence
-        if self.max_p is not None:
-            if not 0.0 < self.max_p < 1.0:
-                raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
+        if self.max_p is not None and self.max_rate is not None:
+            raise ValueError("Expected max_p or max_rate, not both: one run has one limit.")
+        if self.max_p is not None and not 0.0 < self.max_p < 1.0:
+            raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
+        if self.max_rate is not None and not 0.0 < self.max_rate < math.inf:
+            raise ValueError(f"Expected max_rate above 0, got {self.max_rate!r}.")
+        if self.has_limit:
             one_sided = self.gate_confidence
             if not 0.5 < one_sided < 1.0:
                 raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {one_sided!r}.")

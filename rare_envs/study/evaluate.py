@@ -33,7 +33,7 @@ from rare_envs.study.arguments import BadInput, Question, RunInterrupted, Unwrit
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures
 from rare_envs.study.question import Study, build_problem, digest_files, find_changed_files, open_question, prepare
-from rare_envs.study.report import Repeatability, Report
+from rare_envs.study.report import Repeatability, Report, find_frequency
 from rare_envs.study.run_folder import STUDY
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
@@ -86,6 +86,9 @@ def run(
     start, study = time.perf_counter(), settle_chunk(study, executor)
     advice = "" if journal else " With --out finished simulations would have been kept."
     question, problem = study.question, study.problem
+    if question.max_rate is not None:
+        with as_bad_input(ValueError):
+            find_frequency(study)
     evaluator = Evaluator(
         problem if study.ego_was_given else SentProblem(problem, question),
         question.gamma,

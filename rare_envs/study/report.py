@@ -15,7 +15,7 @@ import samplers
 from agents.saved_ego import SavedEgo
 from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.exposure import CollisionProbability, CollisionRate, explain_no_frequency, read_source
+from rare_envs.exposure import MILLION_KM, CollisionProbability, CollisionRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
@@ -121,6 +121,23 @@ class Repeatability(NamedTuple):
             f"to {self.largest:.3g}: the ego or the measure is random, keeps something from one call to the next, or "
             "mixes the rows of a batch, so p may be wrong by any factor; rare-envs check-ego may say where"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateVerdict(samplers.Verdict):
+    """Whether the collisions per million km are below a limit; the ends of p hold the error of the frequency."""
+
+    max_rate: float
+    """Limit of the collisions per million km."""
+    per_p: float
+    """Collisions per million km over p."""
+
+    def __str__(self) -> str:
+        """Return one sentence."""
+        low, high = self.per_p * self.low, self.per_p * self.high
+        ends = f"one-sided ends {low:.2g} and {high:.2g} at {100 * self.confidence:.4g} % confidence"
+        reason = f", as {self.reason}" if self.reason else ""
+        return f"{self.decision}: {self.max_rate:g} collisions per million km are the limit, {ends}{reason}"
 
 
 @dataclass(frozen=True)
@@ -242,15 +259,30 @@ class Report:
 
     @cached_property
     def verdict(self) -> samplers.Verdict | None:
-        """Whether p is below the limit of the question; None without a limit."""
+        """Whether p, or the rate, is below the limit of the question; None without a limit."""
         question = self.study.question
-        if question.max_p is None:
+        if question.max_rate is not None:
+            found: samplers.Verdict = self._judge_rate(question.max_rate)
+        elif question.max_p is not None:
+            found = self.estimate.meets(question.max_p, question.given_base)
+        else:
             return None
-        found = self.estimate.meets(question.max_p, question.given_base)
         doubts = self.doubts_of_f  # the others are the estimate's own
         if found.reason or not doubts:
             return found
         return replace(found, decision="undecided", reason=f"there is a warning: {doubts[0].rstrip('.')}")
+
+    def _judge_rate(self, limit: float) -> RateVerdict:
+        """Return whether the rate is below a limit; the errors of the base count unless it is given."""
+        estimate, given = self.estimate, self.study.question.given_base
+        rate = self._rate_of(estimate.p, estimate.cov, estimate.interval, None) if given else self.rate
+        assert rate is not None  # `run` has looked for the frequency before
+        scale = MILLION_KM * rate.frequency.per_km
+        of_p = estimate.meets(min(limit / scale, 1.0 - 1e-9), given)  # which knows the doubts of the estimate
+        low, high = rate.interval_per_million_km
+        decision = "passes" if high < limit else "fails" if low > limit else "undecided"
+        known = {"low": low / scale, "high": high / scale, "max_rate": limit, "per_p": scale}
+        return RateVerdict(**{**vars(of_p), **known, "decision": "undecided" if of_p.reason else decision})
 
     @cached_property
     def curve(self) -> samplers.Curve | None:

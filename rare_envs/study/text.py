@@ -238,7 +238,7 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
     console.print(head, style="bold")
     ends = "{:.3e} to {:.3e}".format(*estimate.interval)
     if report.verdict is not None:
-        ends += f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for --max-p)"
+        ends += f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for the limit)"
     console.print(_write_row(f"{100 * estimate.confidence:g} % interval", ends))
     if report.verdict is not None:
         console.print(_write_row("limit", str(report.verdict)), style="bold")

@@ -1,7 +1,7 @@
 """Commands of the command line `rare-envs`: each reads its options, calls one function and prints.
 
 Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnings that make the number doubtful; with
---max-p 0 passes, 4 fails, 5 undecided.
+--max-p or --max-rate 0 passes, 4 fails, 5 undecided.
 """
 
 from __future__ import annotations

@@ -64,8 +64,8 @@ def estimate_command(
         raise BadInput("Expected an environment: rare-envs estimate ENV, or env: ENV in the file of --config.")
     question = Question(**chosen)
     for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
-        if question.max_p is None and name in typed | set(given):
-            raise BadInput(f"Expected {option} together with --max-p, the limit of p.")
+        if not question.has_limit and name in typed | set(given):
+            raise BadInput(f"Expected {option} together with --max-p or --max-rate, the limit.")
     with as_bad_input(ValueError):
         executor = ExecutorOptions(**of_executor).make()
     if is_highway_env_id(question.env_id):

@@ -130,7 +130,7 @@ UNUSABLE = (
     ("ego: null\n", "Expected ego to be a text, got None"),
     ("base: [unclosed\n", "is no YAML"),
     ("executor: cloud\n", "executor to be local or ray, got 'cloud'"),
-    ("confidence: 0.9\n", "Expected --confidence together with --max-p"),
+    ("confidence: 0.9\n", "Expected --confidence together with --max-p or --max-rate"),
 )
 
 

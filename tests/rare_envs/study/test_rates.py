@@ -53,6 +53,20 @@ def test_the_rate_is_p_times_the_frequency_with_the_interval_by_hand(bases: dict
     assert report.no_rate == ""
 
 
+def test_a_limit_of_the_rate_is_compared_with_its_one_sided_ends(bases: dict[str, str]) -> None:
+    """42 brakings in 218 km; a third of them end in a collision of this base."""
+    rate = run(prepare(question(bases["hard_brake"], max_rate=1e5))).rate
+    assert rate.confidence == 0.9
+    low, high = rate.interval_per_million_km
+    limits = {1.001 * high: "passes", 0.999 * low: "fails", rate.per_million_km: "undecided"}
+    for limit, decision in limits.items():
+        report = run(prepare(question(bases["hard_brake"], max_rate=limit)))
+        assert report.verdict.decision == decision == report.to_dict()["gate"]["decision"]
+        assert f"{decision}: {limit:g} collisions per million km are the limit, one-sided" in str(report.verdict)
+    given = run(prepare(question(bases["hard_brake"], max_rate=1.2 * rate.per_million_km, given_base=True)))
+    assert given.verdict.low > report.verdict.low and given.verdict.high < report.verdict.high
+
+
 def test_nothing_failed(tmp_path: Path) -> None:
     base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
     report = run(prepare(question(base, max_sim=100)))

@@ -78,7 +78,7 @@ def test_a_gate_is_one_sentence_and_recorded(cli: Cli, risky: str, tmp_path: Pat
     result = cli(*SMALL, "--base", risky, "--max-p", 0.2, "--confidence", 0.99, "--out", tmp_path / "run")
     assert result.exit_code == GATE_CODES["passes"] == 0
     assert "passes: p is below 0.2 with 99 % confidence (one-sided upper end" in result.stdout
-    assert "98 % interval" in result.stdout and "(each end is one-sided at 99 %, for --max-p)" in result.stdout
+    assert "98 % interval" in result.stdout and "(each end is one-sided at 99 %, for the limit)" in result.stdout
     recorded = json.loads((tmp_path / "run" / "result.json").read_text())
     assert recorded["question"]["max_p"] == 0.2 and recorded["gate"]["decision"] == "passes"
     answer = json.loads(cli(*SMALL, "--base", risky, "--max-p", 0.001, "--json").stdout)
