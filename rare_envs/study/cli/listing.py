@@ -30,7 +30,7 @@ TICK = 0.1
 EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default); with other parameters: idm?time_headway=2",
     "human": "attentive human driver by a published model with reaction time, errors and glances, docs/human_driver.md",
-    "human:no-headway-rule": "the same, whose glances may be longer than the headway; with human it brackets people",
+    "human:no-headway-rule": "the same, whose glances may be longer than the headway; look at both",
     "imitation": "shipped ego with lidar, learned from recorded traffic and from encounters",
     "mgail, gail, FILE.safetensors": "learned driver with lidar, by mean actions",
     "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
