@@ -94,7 +94,7 @@ class _Sight(NamedTuple):
     speed: Tensor
     """Own speed [m/s]."""
     acceleration: Tensor
-    """Own acceleration [m/s^2]."""
+    """Own acceleration over the last tick [m/s^2]: felt, so weak brakes are felt too."""
 
 
 class _HumanMemory(NamedTuple):
@@ -115,8 +115,6 @@ class _HumanMemory(NamedTuple):
     glance: _Glance
     known: Ahead
     """What was seen last, carried forward at constant speeds while the eyes were off the road."""
-    acceleration: Tensor
-    """Present acceleration [m/s^2], (B,)."""
     evasion: Tensor
     """Tick of the evasive manoeuvre, int64, (B,): 0 for none, negative to the left, positive to the right."""
 
@@ -191,8 +189,8 @@ class HumanDriver:
         """Decide by what was seen a reaction time ago, or last; see `Driver`."""
         model, dt = self.model, self.world.clock.dt
         memory = self._begin(episode) if memory is None else memory
-        tick, acceleration = memory.tick, memory.acceleration
         seen, since = self._look(episode, memory)
+        tick, acceleration = memory.tick, seen.acceleration
         past = (*memory.past, seen)[-self.delay - 1 :]
         late = past[0]
         glance = self._look_away(memory, late)
@@ -203,7 +201,7 @@ class HumanDriver:
         wanted = respond(lead, known.acceleration, speed, model)
         actual = torch.maximum(wanted, acceleration.clamp(max=0.0) - model.jerk * dt)
         steering, evasion = self._steer(episode, memory.evasion, late, glance.away)
-        last = (episode.state.speed[:, 1:], past, glance, known, actual, evasion)
+        last = (episode.state.speed[:, 1:], past, glance, known, evasion)
         return torch.stack((actual, steering), dim=1), _HumanMemory(tick + 1, memory.zone, memory.beside, since, *last)
 
     def _begin(self, episode: Episode) -> _HumanMemory:
@@ -218,7 +216,7 @@ class HumanDriver:
         since, none = torch.where(beside, -1, _ALWAYS), torch.zeros_like(nothing, dtype=torch.int64)
         glance = _Glance(none, torch.zeros_like(episode.collided), torch.full_like(nothing, torch.inf))
         nobody = Ahead(torch.full_like(nothing, torch.inf), nothing, nothing)
-        return _HumanMemory(0, zone, beside, since, state.speed[:, 1:], (), glance, nobody, nothing, none)
+        return _HumanMemory(0, zone, beside, since, state.speed[:, 1:], (), glance, nobody, none)
 
     def _look(self, episode: Episode, memory: _HumanMemory) -> tuple[_Sight, Tensor]:
         """Return what there is to see, and for how many ticks each vehicle has been in its zone (B, V)."""
@@ -236,7 +234,9 @@ class HumanDriver:
             near = noticed & memory.beside & (offset < VEHICLE_WIDTH + model.evasive_clearance)
             near = near & ((state.x[:, 1:] - state.x[:, :1]).abs() < VEHICLE_LENGTH + model.evasive_reach)
             on_left, on_right = (near & (lateral < 0.0)).any(dim=1), (near & (lateral >= 0.0)).any(dim=1)
-        return _Sight(ahead, on_left, on_right, state.speed[:, 0], memory.acceleration), since
+        speed = state.speed[:, 0]
+        felt = (speed - memory.past[-1].speed) / dt if memory.past else torch.zeros_like(speed)
+        return _Sight(ahead, on_left, on_right, speed, felt), since
 
     def _look_away(self, memory: _HumanMemory, late: _Sight) -> _Glance:
         """Return the glance that is due: one is begun where nothing comes nearer, and looming ends it.

@@ -16,9 +16,10 @@ from rare_envs.control.human_driver import Glances, HumanDriverModel
 from rare_envs.control.idm import IDM, improved_acceleration
 from rare_envs.egos.human import HumanDriver, HumanEgo
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import World, drive
+from rare_envs.simulation.world import World, drive, rollout
 from rare_envs.traffic.bodies import lead_index
 from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import STANDARD_GRAVITY
 
 SCENARIOS = ("CarFollowing", "CutIn", "HardBrake")
 FLAWLESS = HumanDriverModel(
@@ -248,3 +249,15 @@ def test_worlds_and_stacks_that_it_does_not_fit_are_refused() -> None:
     world = problem("CutIn").world
     with pytest.raises(ValueError, match="call with_draws first"):
         HumanEgo().in_world(world).act(world.start(torch.zeros(1, 6)), None)
+
+
+def test_a_driver_feels_that_its_brakes_are_limited() -> None:
+    """It then drives as one that never wants to brake by more than 0.5 g, whatever it would do with better brakes."""
+    weak = replace(SURE, idm=replace(SURE.idm, max_deceleration=0.5 * STANDARD_GRAVITY))
+    x = torch.tensor([[20.0, 5.0, 30.0], [30.0, 10.0, 30.0]])
+    ends = []
+    for model, rapid in ((SURE, True), (SURE, False), (weak, True)):
+        around = problem("CarFollowing", HumanEgo(model))
+        ends.append(rollout(replace(around.world, rapid=rapid), around.driver, x).state.x[:, 0])
+    torch.testing.assert_close(ends[1], ends[2])
+    assert bool((ends[0] < ends[1]).all())
