@@ -173,6 +173,13 @@ def keep_straight(x: float, speed: float, acceleration: float, dt: float) -> tup
 
 
 @compiled
+def lost_share(time: float, duration: float) -> float:
+    """Return the share of a loss of speed after a time: `rare_envs.scenarios.hard_brake.lost_share`."""
+    u = clip(time / duration, ZERO, ONE)
+    return u * u * (THREE - TWO * u)
+
+
+@compiled
 def bicycle(
     x: float, y: float, heading: float, speed: float, acceleration: float, steering: float, dt: float
 ) -> tuple[float, float, float, float]:

@@ -168,6 +168,7 @@ def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> Ste
     eventful = step(table, vehicles, action, script, stepped)
     before, after = (each[: 4 * vehicles].reshape(4, vehicles, len(f)) for each in (start, table))
     x, y, heading, speed = (tensor(field.T) for field in after)
+    theta = tensor(table[4 * vehicles : len(start)].T)
     lead, now, least = Lead(*map(tensor, stepped.lead)), tensor(stepped.f == COLLISION), tensor(stepped.f)
     statistics = episode.statistics
     assert statistics is not None
@@ -177,7 +178,7 @@ def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> Ste
         record_crashes(before, after, episode.collided.numpy(), now.numpy(), script.road, script.dt, own, others)
         statistics = EpisodeStatistics(least, *(crash.Crash(*map(tensor, each)) for each in (own, others)))
     moved = episode._replace(
-        state=State(x, y, heading, speed, old.theta),
+        state=State(x, y, heading, speed, theta),
         lead=lead,
         measure_state=least,
         collided=now,

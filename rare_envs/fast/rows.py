@@ -45,7 +45,7 @@ class Rows(NamedTuple):
     cosine: SingleArray
     """Of the heading; of the ego without meaning."""
     theta: SingleArray
-    """Of the state, shape (P, B)."""
+    """Of the state, shape (P, B), with the memory of scripts that have some."""
     acceleration: SingleArray
     """Of the ego [m/s^2], shape (B,), likewise the next five."""
     steering: SingleArray
@@ -98,8 +98,11 @@ def move_others(rows: Rows, script: ScriptNumbers) -> None:
     if script.number == CUT_IN:
         cut_in(rows, script.cutter_idm, dt)
     elif script.number == BRAKING:
+        start, loss, lasting, time = rows.theta[0], rows.theta[1], rows.theta[2], rows.theta[3]
         for row in range(rows.size):
-            x[row], speed[row] = eq.keep_straight(x[row], speed[row], -rows.theta[0, row], dt)
+            time[row] += dt
+            x[row] += speed[row] * dt
+            speed[row] = start[row] - loss[row] * eq.lost_share(time[row], lasting[row])
     else:
         for row in range(rows.size):
             x[row] += speed[row] * dt

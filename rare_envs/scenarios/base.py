@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -17,14 +17,35 @@ from torch import Tensor
 
 from rare_envs.devices import scalars
 from rare_envs.distributions.fitted import FITTED_KEYS, FileDistribution, FittedDistribution, read_distribution
+from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.files import parse_json_object
 from rare_envs.plugins import did_you_mean
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import Motion, State, point_mass
+from rare_envs.traffic.state import State, point_mass
 
-Others = Motion
-"""Vehicles 1 to N - 1 after a tick; shapes (B, N - 1)."""
+
+class Others(NamedTuple):
+    """Vehicles 1 to N - 1 after a tick, as `rare_envs.traffic.state.Motion`, and what their script remembers.
+
+    Example:
+        >>> one = torch.full((1, 1), 12.0)
+        >>> Others(x=one, y=0 * one, heading=0 * one, speed=one).theta is None  # a script without memory
+        True
+    """
+
+    x: Tensor
+    """Centres along the road [m], shape (B, N - 1)."""
+    y: Tensor
+    """Centres across the road [m], positive to the right, shape (B, N - 1)."""
+    heading: Tensor
+    """Headings relative to the road [rad], shape (B, N - 1)."""
+    speed: Tensor
+    """Speeds along the headings [m/s], shape (B, N - 1)."""
+    theta: Tensor | None = None
+    """The state's theta after the tick, shape (B, P), where the script keeps its memory in it; None if it stays."""
+
+
 SPEED_RANGE = ("m/s", 0.0, 45.0)
 """Unit and range of a speed as a parameter. Nobody drives backwards, and 45 m/s (162 km/h) is above what congested
 US 101 (at most 27 m/s in the events) and free-flow traffic reach."""
@@ -74,6 +95,12 @@ class Scenario:
     have drivers."""
     drivers: str | None = None
     """Drivers of the other vehicles unless told otherwise; None for the script."""
+    signals: Callable[[State], Tensor] | None = None
+    """State, the ego first, to which other vehicles have their indicator on towards the ego's lane, boolean,
+    (B, N - 1); None where nobody ever has."""
+    evades: Callable[[State], Tensor] | None = None
+    """State to whether a vehicle that had not looked has evaded the ego by now, boolean, (B,): a rapid evasive
+    manoeuvre by another vehicle, which makes an episode without contact a near-crash. None where nobody ever does."""
 
     def __post_init__(self) -> None:
         if not all(isinstance(vehicle, str) and vehicle.strip() for vehicle in self.vehicle_names):
@@ -122,6 +149,15 @@ def base_files(prefix: str, *names: str) -> dict[str, Any]:
     """Return the base distributions of these names that come with the package, as files."""
     folder = resources.files("rare_envs") / "data"
     return {name: folder / f"{prefix}_{name.replace('-', '_')}.json" for name in names}
+
+
+def provisional_bases(prefix: str, names: tuple[str, ...], rest: Any) -> dict[str, Any]:
+    """Return shipped distributions of fewer columns with independent ones behind them, until there are fitted ones."""
+    texts = {name: file.read_text(encoding="utf-8") for name, file in base_files(prefix, *names).items()}
+    return {
+        name: ProductDistribution((read_distribution(parse_json_object(text, name)), rest))
+        for name, text in texts.items()
+    }
 
 
 def columns(*values: Tensor) -> Tensor:
@@ -307,15 +343,24 @@ def try_scenario(scenario: Scenario) -> None:
         raise ValueError(f"{wrong}expected theta of {_DRAWS} rows, got {tuple(state.theta.shape)}.")
     _check(wrong, "initial(x)", state[:4], n)
     action = torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2)
-    _check(wrong, "others(state, dt)", scenario.others(state, _DT), n - 1)
-    _check(wrong, "driven(state, action, dt)", scenario.driven(state, action, _DT), n - 1)
+    for what, after in {
+        "others(state, dt)": scenario.others(state, _DT),
+        "driven(state, action, dt)": scenario.driven(state, action, _DT),
+    }.items():
+        _check(wrong, what, after, n - 1)
+        theta = getattr(after, "theta", None)
+        if theta is not None and (not isinstance(theta, Tensor) or theta.shape != state.theta.shape):
+            shape = tuple(state.theta.shape)
+            raise ValueError(
+                f"{wrong}expected {what} to keep theta's shape {shape}, got {getattr(theta, 'shape', theta)}."
+            )
 
 
 def _check(wrong: str, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
     """Check that fields are tensors (B, vehicles) of finite numbers."""
     if not isinstance(fields, tuple) or len(fields) < 4 or not all(isinstance(field, Tensor) for field in fields[:4]):
         raise ValueError(f"{wrong}expected {what} to give x, y, heading and speed, as State or Others; got {fields!r}.")
-    for name, field in zip(State._fields, fields, strict=False):
+    for name, field in zip(State._fields, fields[:4], strict=False):
         if field.shape != (_DRAWS, vehicles):
             shapes = f"{name} of shape (B, {vehicles}) from {what}, got {tuple(field.shape)} for B = {_DRAWS}"
             raise ValueError(f"{wrong}expected {shapes}.")

@@ -27,7 +27,7 @@ SCENARIOS = Registry(
     {
         "rare_envs/CarFollowing-v0": "rare_envs.scenarios.car_following:CAR_FOLLOWING",
         "rare_envs/CutIn-v0": "rare_envs.scenarios.cut_in:CUT_IN",
-        "rare_envs/CutIn-v1": "rare_envs.scenarios.cut_in:TIMED_CUT_IN",
+        "rare_envs/CutIn-v1": "rare_envs.scenarios.cut_in:CUT_IN_V1",
         "rare_envs/Highway-v0": "rare_envs.scenarios.highway:HIGHWAY",
         "rare_envs/HardBrake-v0": "rare_envs.scenarios.hard_brake:HARD_BRAKE",
     }

@@ -112,7 +112,8 @@ def record(world: World, driver: Driver, x: Tensor, size: int) -> Recording:
 def is_recordable(world: World, driver: Driver) -> bool:
     """Return whether nothing about a rollout but x can change: as drivers' classes say, for nothing of a user's."""
     drivers = (driver,) if world.background is None else (driver, world.background)
-    scripts = (world.scenario.initial, world.scenario.others, world.scenario.driven)
+    scenario = world.scenario
+    scripts = (scenario.initial, scenario.others, scenario.driven, scenario.signals)
     own = (script is None or str(getattr(script, "__module__", "")).startswith("rare_envs.") for script in scripts)
     measure = world.measurement.episode_measure
     read = (measure.measure, measure.order) if isinstance(measure, TermTracker) else (measure,)

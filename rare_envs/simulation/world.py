@@ -377,8 +377,9 @@ class World:
         overridden = episode.overridden
         if commanded is not None or overridden is not None:
             others, overridden = apply_overrides(episode, action, commanded, others, driver_actions, dt)
-        rest = zip(*(field.unbind(1) for field in others), strict=True)
-        state = State.of_vehicles((moved, *rest), old.theta)
+        rest = zip(*(field.unbind(1) for field in others[:4]), strict=True)
+        theta: Tensor | None = getattr(others, "theta", None)  # a user's script may return any four fields
+        state = State.of_vehicles((moved, *rest), old.theta if theta is None else theta)
         place, perception = self._look(state)
         hit = overlaps(state, road, "ego", place).any(dim=1) | road.off_road(state.vehicles[0].y)
         if self.measurement.collisions == "any":
@@ -439,8 +440,9 @@ def rule_based_actions(episode: Episode) -> Tensor:
 
 
 def _choose(which: Tensor, one: Others, other: Others) -> Others:
-    """Return one where `which` is set, boolean, shape (B, N - 1), and the other elsewhere."""
-    return Others(*(torch.where(which, a, b) for a, b in zip(one, other, strict=True)))
+    """Return one where `which` is set, boolean, shape (B, N - 1), and the other elsewhere, with its memory."""
+    chosen = (torch.where(which, a, b) for a, b in zip(one[:4], other[:4], strict=True))
+    return Others(*chosen, theta=getattr(other, "theta", None))
 
 
 class Driver(Protocol):

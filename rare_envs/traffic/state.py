@@ -55,7 +55,7 @@ class _Fields(NamedTuple):
     speed: Tensor
     """Speeds along the headings [m/s], never negative, shape (B, N)."""
     theta: Tensor
-    """Parameters that the scenario fixes for the whole episode, shape (B, P); it defines the P columns."""
+    """Parameters of the episode and memory of its script, shape (B, P); the scenario defines the P columns."""
 
 
 class State(_Fields):

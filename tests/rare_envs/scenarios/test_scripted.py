@@ -7,10 +7,11 @@ import pytest
 import torch
 
 import rare_envs
+from rare_envs import IDM
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_DURATION, TIMED_CUT_IN, bezier
+from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_V1, bezier
 from rare_envs.simulation import drive
-from rare_envs.simulation.world import World
+from rare_envs.simulation.world import Clock, World
 from tests.rare_envs.traffic_states import F64, tensor
 
 
@@ -28,18 +29,23 @@ def test_car_following_without_brakes_collides_when_the_gap_is_used_up() -> None
     assert episode.f.item() == -1.0
 
 
-def test_the_lead_stops_after_its_braking_distance() -> None:
-    """From 20 m/s at 4 m/s^2 it stands after v / a = 5 s and v^2 / 2a = 50 m, and then stays."""
+@pytest.mark.parametrize(("peak", "loss", "lost"), [(4.0, 20.0, 20.0), (4.0, 45.0, 20.0), (3.0, 8.0, 8.0)])
+def test_the_lead_brakes_in_a_parabola(peak: float, loss: float, lost: float) -> None:
+    """From 20 m/s: T = 1.5 loss / peak, mean deceleration 2/3 of the peak, way in T of (20 - loss / 2) T."""
     problem = rare_envs.DrivingProblem("rare_envs/HardBrake-v0", horizon=8.0)
-    x = torch.tensor([[20.0, 100.0, 4.0]])
-    states = [episode.state for episode in drive(problem.world, problem.driver, x)]
-    speed = torch.stack([state.speed[0, 1] for state in states]).numpy()
-    place = torch.stack([state.x[0, 1] for state in states]).numpy()
-    dt = problem.world.clock.dt
-    np.testing.assert_allclose(speed, np.maximum(20.0 - 4.0 * dt * np.arange(len(speed)), 0.0), atol=1e-4)
-    # one step of Euler's method with the speed before or after it: half a step of speed in all
-    assert place[-1] - place[0] == pytest.approx(50.0, abs=0.5 * dt * 20.0 + 1e-3)
-    assert place[-1] == place[-2]
+    states = [each.state for each in drive(problem.world, problem.driver, tensor(20.0, 100.0, peak, loss)[None])]
+    speed, place = (
+        torch.stack([each[0, 1] for each in field]).numpy()
+        for field in zip(*((s.speed, s.x) for s in states), strict=True)
+    )
+    dt, lasting = problem.world.clock.dt, 1.5 * lost / peak
+    u = np.minimum(dt * np.arange(len(speed)) / lasting, 1.0)
+    np.testing.assert_allclose(speed, 20.0 - lost * (3.0 * u**2 - 2.0 * u**3), atol=1e-9)
+    assert -np.diff(speed).min() / dt == pytest.approx(peak, rel=2e-3)
+    assert speed[-1] == 20.0 - lost  # exactly: it stands where it loses all
+    # one step of Euler's method with the speed before or after it: half a step of the loss in all
+    way = (20.0 - lost / 2) * lasting + (20.0 - lost) * (8.0 - lasting)
+    assert place[-1] - place[0] == pytest.approx(way + dt * lost / 2, abs=1e-3)
 
 
 def test_bezier_is_de_casteljau_and_level_at_both_ends() -> None:
@@ -73,14 +79,9 @@ def test_cutter_arrives_in_the_lane_and_minds_its_lead() -> None:
 
 def drive_straight(duration: float, offset: float = 3.0, speed: float = 30.0, dt: float = 0.05) -> torch.Tensor:
     """Return y of a cutter that keeps its speed, at each tick from the start on."""
-    state = TIMED_CUT_IN.initial(tensor(20.0, speed, 25.0, 40.0, 60.0, offset, duration)[None])
-    found = [state.y[0, 1]]
-    for _ in range(round(1.5 * duration / dt)):
-        after = TIMED_CUT_IN.driven(state, torch.zeros(1, 2, 2, dtype=F64), dt)
-        moved = {name: torch.cat([getattr(state, name)[:, :1], getattr(after, name)], 1) for name in after._fields}
-        state = state._replace(**moved)
-        found.append(state.y[0, 1])
-    return torch.stack(found)
+    world = World(CUT_IN_V1, clock=Clock(dt, 1.5 * duration))
+    x = tensor(20.0, speed, speed, 40.0, 150.0, offset, duration, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0)
+    return torch.stack([each.state.y[0, 1] for each in drive(world, IDM(), x[None])])
 
 
 @pytest.mark.parametrize("duration", [2.0, 4.0, 7.5])
@@ -99,13 +100,3 @@ def test_a_change_takes_its_duration_and_crosses_the_marking_in_its_middle(durat
     assert duration / 2 <= crossing <= duration / 2 * 1.0015 + dt
     assert t[y <= 0.8 * 3.0][0].item() == pytest.approx(0.287 * duration, abs=dt + 0.001 * duration)
     assert y[-1].item() == 0.0
-
-
-def test_four_seconds_are_the_first_version_to_the_bit() -> None:
-    first, second = (rare_envs.DrivingProblem(f"rare_envs/CutIn-v{version}", base="us101") for version in (0, 1))
-    assert first.space.names == second.space.names[:6]
-    x = rare_envs.DrivingProblem("rare_envs/CutIn-v0", base="i80").base.sample(400, np.random.default_rng(2))
-    f = first.evaluate(x)
-    assert (second.evaluate(np.column_stack([x, np.full(400, CUT_IN_DURATION)])) == f).all()
-    slow, fast = (second.evaluate(np.column_stack([x, np.full(400, seconds)])) for seconds in (8.0, 2.0))
-    assert (slow <= 0.0).sum() > (f <= 0.0).sum() > (fast <= 0.0).sum() > 0
