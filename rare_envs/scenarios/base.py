@@ -350,10 +350,7 @@ def try_scenario(scenario: Scenario) -> None:
         _check(wrong, what, after, n - 1)
         theta = getattr(after, "theta", None)
         if theta is not None and (not isinstance(theta, Tensor) or theta.shape != state.theta.shape):
-            shape = tuple(state.theta.shape)
-            raise ValueError(
-                f"{wrong}expected {what} to keep theta's shape {shape}, got {getattr(theta, 'shape', theta)}."
-            )
+            raise ValueError(f"{wrong}expected {what} to keep the shape {tuple(state.theta.shape)} of theta.")
 
 
 def _check(wrong: str, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
