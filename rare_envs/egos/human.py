@@ -229,9 +229,9 @@ class HumanDriver:
         if signals is not None and model.notice_indicator:
             noticed = noticed | signals(state)
         ahead = find_ahead(state, noticed, memory.speeds, dt)
-        on_left = on_right = episode.collided
-        if self.evades is not None:
-            near = noticed & memory.beside & (offset < VEHICLE_WIDTH + model.evasive_clearance)
+        on_left = on_right = torch.zeros_like(episode.collided)
+        near = noticed & memory.beside & (offset < VEHICLE_WIDTH + model.evasive_clearance)
+        if self.evades is not None and may_hold(near):
             near = near & ((state.x[:, 1:] - state.x[:, :1]).abs() < VEHICLE_LENGTH + model.evasive_reach)
             on_left, on_right = (near & (lateral < 0.0)).any(dim=1), (near & (lateral >= 0.0)).any(dim=1)
         speed = state.speed[:, 0]
