@@ -18,7 +18,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
-from rare_envs.scenarios.registry import env_id_of, find_scenario, scenario_named
+from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.startup import __version__
 from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer
@@ -53,19 +53,17 @@ def list_sites(scenario: Scenario) -> dict[str, str]:
     return found
 
 
-def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> tuple[str, tuple[str, ...]]:
-    """Return the base distribution of a scenario at a site, and notes on it."""
+def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> str:
+    """Return the base distribution of a scenario at a site, or the one that is given."""
     if given is not None:
-        return str(given), ()
+        return str(given)
     sites = list_sites(scenario)
     if site not in sites:
         raise ValueError(
             f"{scenario.name} has no base of the site {site!r} (it has {', '.join(sites) or 'none'}): "
             f"--base {scenario.name}={scenario.default_base} takes another one."
         )
-    bases = {name: _load_fitted(scenario, name) for name in (site, *scenario.bases)}
-    found = next((name for name, base in bases.items() if base is not None and base.frequency is not None), site)
-    return found, () if found == site else (f"it has no event frequency at {site!r}: {found!r} is used",)
+    return site
 
 
 def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:
@@ -98,7 +96,6 @@ class ScenarioRisk:
     """Its collisions per hour and per km."""
     site_factors: Mapping[str, float]
     """Rates under the bases of other sites over that under its own, by name, as far as they are known."""
-    notes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -130,7 +127,6 @@ class ScenarioRisk:
             "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
-            "notes": list(self.notes),
             "report": self.report.to_dict(),
         }
 
@@ -184,8 +180,10 @@ class Risk:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Errors that are left out, and bases that differ from those asked for."""
-        return tuple(f"{text.name_scenario(each.name)}: {note}" for each in self.scenarios for note in each.notes)
+        """What the rates leave out, and what made no difference, by scenario."""
+        return tuple(
+            f"{text.name_scenario(each.name)}: {note}" for each in self.scenarios for note in each.report.notes
+        )
 
     def __str__(self) -> str:
         """Return the table, for people: the total first, a line for each event, warnings last."""
@@ -279,24 +277,23 @@ def risk(
     with as_bad_input(TypeError):
         asked = {"ego": ego_name, **options}
         questions = [
-            Question(env_id=env_id_of(name), base=base, **asked)
-            for name, (base, _) in zip(scenarios, chosen, strict=True)
+            Question(env_id=env_id_of(name), base=base, **asked) for name, base in zip(scenarios, chosen, strict=True)
         ]
-    left_out = _find_misfits(questions, None if named else ego)
+    left_out = _find_misfits(dict(zip(scenarios, questions, strict=True)), None if named else ego)
     with as_bad_input(ValueError):
-        fitting = [each for each in zip(questions, chosen, scenarios, strict=True) if each[2] not in left_out]
+        fitting = {name: each for name, each in zip(scenarios, questions, strict=True) if name not in left_out}
         if not fitting:
             names = ", ".join(map(text.name_scenario, scenarios))
             raise ValueError(f"The ego fits none of the scenarios {names}. {next(iter(left_out.values()))}")
-        studies = [prepare(question, None if named else ego) for question, _, _ in fitting]
+        studies = [prepare(question, None if named else ego) for question in fitting.values()]
         for study in studies:
             find_frequency(study)
-    for _, _, name in fitting if folder is not None and not force else ():  # all of them, before the first one is run
+    for name in fitting if folder is not None and not force else ():  # all of them, before the first one is run
         check_no_results(Path(folder or "", name))
     done: list[ScenarioRisk] = []
-    for study, (_, (_, notes), _) in zip(studies, fitting, strict=True):
+    for study in studies:
         try:
-            done.append(_evaluate(study, notes, sites[1:], folder, progress, force))
+            done.append(_evaluate(study, sites[1:], folder, progress, force))
         except RunInterrupted as error:
             known = "; ".join(f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done)
             raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
@@ -329,23 +326,23 @@ def _check_scenarios(names: Sequence[str], sites: Sequence[str], bases: Mapping[
         raise ValueError(f"No base of {', '.join(names)} is of a site {site!r}{hint}; there are {there}.")
 
 
-def _find_misfits(questions: Sequence[Question], ego: Any) -> dict[str, str]:
+def _find_misfits(questions: Mapping[str, Question], ego: Any) -> dict[str, str]:
     """Return why an ego, or that of the questions, does not fit scenarios by its observations or actions, by name."""
     found = {}
     with as_bad_input(ValueError, OSError):
-        first = questions[0]
         if ego is None:
+            first = next(iter(questions.values()))
             ego = agents.load_ego(first.ego, algo=first.algo, trust=first.trust, stats=first.stats)
-        for question in questions:
+        for name, question in questions.items():
             try:
                 build_problem(replace(question, base=None, ensemble=False), ego)
             except ValueError as error:
-                found[find_scenario(question.env_id).name] = str(error)
+                found[name] = str(error)
     return found
 
 
 def _evaluate(
-    study: Study, notes: tuple[str, ...], other_sites: Sequence[str], folder: Path | None, progress: bool, force: bool
+    study: Study, other_sites: Sequence[str], folder: Path | None, progress: bool, force: bool
 ) -> ScenarioRisk:
     """Run one scenario and return its rate, with the spread between sites if there are others."""
     name = study.problem.world.scenario.name
@@ -355,4 +352,4 @@ def _evaluate(
         factors = compare_sites(report, other_sites, progress)
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
     rate = replace(report.rate, site_log_sd=float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0)
-    return ScenarioRisk(report=report, rate=rate, site_factors=factors, notes=(*notes, *report.notes))
+    return ScenarioRisk(report=report, rate=rate, site_factors=factors)

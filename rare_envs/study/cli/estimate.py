@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
-LEADER_SCENARIOS = {"cut-in": "cut_in", "car-following": "car_following"}
-"""Scenarios in which the ego gets a new leader; each is run beside the hard brake, and they count nothing twice."""
 OPTIONS = frozenset(
     "env ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
     "workers executor address time_limit memory_limit config out force as_json".split()
@@ -215,9 +213,9 @@ def plan_command(
 def risk_command(
     ego: shell.EgoArgument,
     asked: dict[str, Any],
-    leaders: Annotated[
-        str, Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following.")
-    ] = "cut-in",
+    scenario: Annotated[
+        list[str] | None, Option(help="Scenario of the sum; may be repeated.", show_default="cut_in and hard_brake")
+    ] = None,
     sites: Annotated[
         str,
         Option(help="Site of the bases, us101 or i80; both, joined by a comma, for the spread between sites."),
@@ -230,24 +228,19 @@ def risk_command(
     force: shell.ForceOption = False,
 ) -> Answer:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
-    from rare_envs.study.risk import risk
+    from rare_envs.study.risk import SCENARIO_SET, risk
 
-    if leaders not in LEADER_SCENARIOS:
-        raise BadInput(
-            f"Expected --with {' or --with '.join(LEADER_SCENARIOS)}, got {leaders!r}: the sum is that of the hard "
-            "brake and one scenario of new leaders, whose events were counted and are not in it twice."
-        )
     bases: dict[str, str] = {}
-    for scenario, _, name in (word.partition("=") for word in base or []):
-        if not scenario or not name:
-            raise BadInput(f"Expected --base SCENARIO=NAME, such as cut_in=i80, got {scenario!r} alone.")
-        if scenario in bases:
-            raise BadInput(f"Expected one --base for each scenario, got several for {scenario!r}.")
-        bases[scenario] = name
+    for owner, _, name in (word.partition("=") for word in base or []):
+        if not owner or not name:
+            raise BadInput(f"Expected --base SCENARIO=NAME, such as cut_in=i80, got {owner!r} alone.")
+        if owner in bases:
+            raise BadInput(f"Expected one --base for each scenario, got several for {owner!r}.")
+        bases[owner] = name
     with as_bad_input(ValueError):
         found = risk(
             ego,
-            scenarios=(LEADER_SCENARIOS[leaders], "hard_brake"),
+            scenarios=scenario or SCENARIO_SET,
             sites=[site.strip() for site in sites.split(",") if site.strip()],
             bases=bases,
             out=out,

@@ -18,7 +18,7 @@ import samplers
 from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.exposure import CollisionProbability, CollisionRate, ModelCount, calibration
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
-from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.simulation.observation import observation_space
 from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.events import EventRate, split_by_stratum, sum_people
@@ -172,14 +172,8 @@ def test_other_sites_are_known_from_the_same_simulations(monkeypatch: pytest.Mon
 
 
 def test_the_base_of_a_scenario_at_a_site() -> None:
-    """Pairs of US 101 were under way, and cannot be counted; the new leaders of I-80 were."""
-    assert choose_base(HARD_BRAKE, None, "us101") == ("us101", ())
-    assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
-    car_following = scenario_named("car_following")
-    note = "it has no event frequency at 'us101': 'i80' is used"
-    assert choose_base(car_following, None, "us101") == ("i80", (note,))
-    assert choose_base(car_following, None, "i24") == ("i24", ())
-    assert choose_base(car_following, "us101", "us101") == ("us101", ())  # refused with its reason later
+    assert choose_base(HARD_BRAKE, None, "us101") == "us101"
+    assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == "mine.json"
 
 
 def test_a_rate_has_two_digits_and_with_its_interval_one_form() -> None:

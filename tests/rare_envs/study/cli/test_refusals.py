@@ -68,7 +68,7 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     (("plan", "run", "--pilot", 500), ("without --pilot",)),
     (("risk", "idm", *CUDA), ("'cuda:99' is not here",)),
     ((*RISK[:1], "imd", *RISK[2:]), ("idm",)),
-    ((*RISK, "--with", "merge"), ("cut-in or --with car-following", "'merge'")),
+    ((*RISK, "--scenario", "merge"), ("Unknown scenario 'merge'", "cut_in")),
     ((*RISK, "--base", "hard_brake=mine.json"), ("several for 'hard_brake'",)),
     ((*RISK, "--sites", "us101-closing"), ("no site", "'us101'", "cut_in=us101-closing")),
     (("risk", "idm", "--base", "cut_in=broken.json"), ("broken.json", "JSON")),
