@@ -181,7 +181,7 @@ class HumanDriverModel:
     noticing_time: float = 0.4
     """... and for as long as this [s]: the same ("risk evaluation")."""
     notice_indicator: bool = True
-    """Whether a vehicle that signals is noticed at once: assumed, a neighbour who signals is expected to come."""
+    """Whether a vehicle that signals is noticed at once, from the start on if it signals then: assumed."""
     jerk: float = 12.65
     """Fastest build-up of braking [m/s^3]: Regulation 157, 0.774 g within 0.6 s."""
     glances: bool = True

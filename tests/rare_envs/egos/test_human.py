@@ -79,8 +79,8 @@ def test_without_human_limits_it_is_the_improved_idm_with_the_heuristic(name: st
 def test_a_braking_lead_is_answered_one_reaction_time_later(late: float) -> None:
     """Speeds are equal until the lead brakes at 0; the first tick in which its speed differs is 0.1 s."""
     driver = HumanEgo(replace(SURE, reaction_time=late)).in_world(problem("HardBrake").world)
-    x = [15.0, 40.0, 4.0]
-    braking, calm = (accelerations(driver, driver.world, each) for each in (x, [15.0, 40.0, 1e-12]))
+    x = [15.0, 40.0, 4.0, 15.0]
+    braking, calm = (accelerations(driver, driver.world, each) for each in (x, [15.0, 40.0, 1e-12, 15.0]))
     differ = [abs(a - b) > 1e-6 for a, b in zip(braking, calm, strict=True)]
     assert differ.index(True) == round(late / 0.1) + 1
 
@@ -97,6 +97,23 @@ def test_a_cutter_is_answered_after_noticing_and_reacting(offset: float) -> None
     entered = next(tick for tick, y in enumerate(offsets) if y <= offset - 0.375)
     assert 0 < entered < 20
     assert differ.index(True) == entered + 4 + 6
+
+
+@pytest.mark.parametrize("signals", [True, False])
+def test_a_neighbour_who_signals_is_noticed_at_once(signals: bool) -> None:
+    """It is answered from the start on, else after its body has moved, by who ignores indicators too."""
+    world = rare_envs.DrivingProblem("rare_envs/CutIn-v1", ego="human").world
+    x = [20.0, 15.0, 20.0, 25.0, 60.0, 4.0, 6.0, 0.0, 0.0, 1.0 if signals else -1.0, 9.0, 0.0, 0.0]
+    first = {}
+    for notices in (True, False):
+        model = replace(SURE, notice_indicator=notices)
+        found, blind = (
+            accelerations(HumanDriver(each, world), world, x)
+            for each in (model, replace(model, noticing_time=100.0, notice_indicator=False))
+        )
+        first[notices] = next(tick for tick, (a, b) in enumerate(zip(found, blind, strict=True)) if a != b)
+    assert first[False] > 6 + 4
+    assert first[True] == (0 if signals else first[False])
 
 
 def test_braking_builds_up_at_the_published_rate_to_the_published_maximum() -> None:
@@ -132,7 +149,7 @@ def test_in_a_glance_the_lead_is_taken_to_keep_its_speed() -> None:
     glance = Glances(torch.tensor([[0.0, 0.5]]), torch.tensor([[0.0, 2.5]]))
     free = replace(SURE, glance_looming=1.0, headway_rule=False, glance_eccentricity=180.0)
     model = replace(free, reaction_time=0.0)
-    x, until = [15.0, 20.0, 4.0], 5
+    x, until = [15.0, 20.0, 6.0, 15.0], 5
     away = accelerations(HumanDriver(model, world, glances=glance), world, x)
     seeing = accelerations(HumanDriver(model, world), world, x)
     assert away[:until] == seeing[:until]
