@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from rare_envs.egos.policy import PolicyDriver
 from rare_envs.measures import MEASURES
 from rare_envs.plugins import check_name, one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
+from rare_envs.scenarios.cut_in import CUTTER, CutterModel
 from rare_envs.simulation.observation import observation_space
 
 if TYPE_CHECKING:
@@ -27,11 +28,25 @@ if TYPE_CHECKING:
 
 CORES = ("auto", "torch", "numba")
 """Choices of what simulates."""
-SCRIPTS = ((car_following.others, "STEADY", 2), (hard_brake.others, "BRAKING", 2), (cut_in.others, "CUT_IN", 3))
+SCRIPTS = (
+    (car_following.others, "STEADY", 2),
+    (hard_brake.others, "BRAKING", 2),
+    (cut_in.others, "CUT_IN", 3),
+    (CutterModel.others, "HUMAN_CUT_IN", 3),
+)
 """Motions of the other vehicles, names of their compiled twins in `rare_envs.fast.rows`, and how many vehicles these
 are for, the ego included."""
 MAX_UNITS = 128
 """Widest layer: beyond it torch's matrix products are faster than the compiled ones, which are made for few units."""
+
+
+class Script(NamedTuple):
+    """A compiled script."""
+
+    name: str
+    """In `rare_envs.fast.rows`."""
+    cutter: CutterModel = CUTTER
+    """The cutter of `HUMAN_CUT_IN`."""
 
 
 class CompilerFails(NotCompiled):
@@ -80,10 +95,11 @@ def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np
     return f
 
 
-def find_script(world: World, statistics: bool = False) -> str:
-    """Return the name of the compiled script of a world, with statistics of its episodes or not; else NotCompiled."""
+def find_script(world: World, statistics: bool = False) -> Script:
+    """Return the compiled script of a world, with statistics of its episodes or not; else NotCompiled."""
     scenario, measurement = world.scenario, world.measurement
-    known = [(name, vehicles) for others, name, vehicles in SCRIPTS if scenario.others is others]
+    script = getattr(scenario.others, "__func__", scenario.others)  # of a method
+    known = [(name, vehicles) for others, name, vehicles in SCRIPTS if script is others]
     names = [name for name, vehicles in known if scenario.vehicles == vehicles]
     _refuse(
         {
@@ -99,7 +115,7 @@ def find_script(world: World, statistics: bool = False) -> str:
             "parameters of the weather are": world.dim != scenario.size,
         }
     )
-    return names[0]
+    return Script(names[0], getattr(scenario.others, "__self__", CUTTER))
 
 
 def read_ego(world: World, driver: Driver) -> IDM | DensePolicy:

@@ -85,9 +85,9 @@ _CACHE = find_cache()
 
 ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = single(0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0)
 BODY_LENGTH, _HALF_LENGTH, _HALF_WIDTH = single(VEHICLE_LENGTH, VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
-_NEAREST, _MAX_SINE, _MAX_STEERING = single(NEAR_ZERO, MAX_SLIP_SINE, STEERING_LIMIT)
+NEAREST, _MAX_SINE, _MAX_STEERING = single(NEAR_ZERO, MAX_SLIP_SINE, STEERING_LIMIT)
 _MAX_HEADING, _HEADING_GAIN, _LATERAL_GAIN = single(MAX_HEADING_COMMAND, 1.0 / TAU_HEADING, -TAU_LATERAL)
-_LEAST_GAP, _LEAST_SPEED, _LEAST_RATIO, _FAR = single(GAP_MIN, STILL, MIN_RATIO, DIAGONAL)
+_LEAST_GAP, _LEAST_SPEED, _LEAST_RATIO, _FAR, _LEAST_FREE = single(GAP_MIN, STILL, MIN_RATIO, DIAGONAL, 1e-3)
 
 
 class IDMNumbers(NamedTuple):
@@ -194,7 +194,7 @@ def bicycle(
 @compiled
 def steering_for(yaw_rate: float, speed: float) -> float:
     """Return the steering angle [rad]: `rare_envs.traffic.state.steering_for`."""
-    slip = math.asin(clip(_HALF_LENGTH / max(speed, _NEAREST) * yaw_rate, -_MAX_SINE, _MAX_SINE))
+    slip = math.asin(clip(_HALF_LENGTH / max(speed, NEAREST) * yaw_rate, -_MAX_SINE, _MAX_SINE))
     return clip(math.atan(TWO * math.tan(slip)), -_MAX_STEERING, _MAX_STEERING)
 
 
@@ -214,7 +214,7 @@ def off_road(y: float, road: RoadNumbers) -> bool:
 @compiled
 def steer_to_line(offset: float, heading: float, speed: float) -> float:
     """Return the steering angle [rad]: `rare_envs.control.idm.yaw_rate_towards`."""
-    speed = max(speed, _NEAREST)
+    speed = max(speed, NEAREST)
     command = math.asin(clip(offset / (_LATERAL_GAIN * speed), -ONE, ONE))
     command = clip(command, -_MAX_HEADING, _MAX_HEADING)
     return steering_for(_HEADING_GAIN * (command - heading), speed)
@@ -230,14 +230,47 @@ def fourth_power(ratio: float) -> float:
 @compiled
 def idm_acceleration(idm: IDMNumbers, speed: float, gap: float, closing: float, ratio: float, free: float) -> float:
     """Return the acceleration [m/s^2], of speed / desired speed and its power `free`: `IDM.acceleration`."""
+    interaction = idm_interaction(idm, speed, gap, closing, ratio)
+    return at_least(idm.max_acceleration * (ONE - free - interaction), -idm.max_deceleration)
+
+
+@compiled
+def idm_interaction(idm: IDMNumbers, speed: float, gap: float, closing: float, ratio: float) -> float:
+    """Return the square of desired gap / gap: `IDM.interaction`."""
     headway = idm.time_headway + closing * idm.closing_gain
     if idm.cut_off > ZERO:
         headway = max(headway, ZERO)
     desired_gap = idm.jam_distance + speed * headway
     if idm.jam_distance_speed != ZERO:
         desired_gap = desired_gap + idm.jam_distance_speed * np.sqrt(max(ratio, _LEAST_RATIO))
-    share = desired_gap / max(gap + idm.added_length, _NEAREST)
-    return at_least(idm.max_acceleration * (ONE - free - share * share), -idm.max_deceleration)
+    share = desired_gap / max(gap + idm.added_length, NEAREST)
+    return share * share
+
+
+@compiled
+def improved_acceleration(
+    idm: IDMNumbers, comfortable: float, coolness: float, speed: float, gap: float, closing: float, ratio: float
+) -> float:
+    """Return the acceleration [m/s^2] behind a steady lead: `rare_envs.control.idm.improved_acceleration`."""
+    a, interaction = idm.max_acceleration, idm_interaction(idm, speed, gap, closing, ratio)
+    power = fourth_power(ratio) if idm.exponent == FOUR else ratio**idm.exponent
+    near = a - interaction * a
+    if ratio > ONE:
+        above = (ratio ** (-a * idm.exponent / comfortable) - ONE) * comfortable
+        improved = above + min(near, ZERO)
+    elif interaction >= ONE:
+        improved = near
+    else:
+        below = (ONE - power) * a
+        share = math.exp(math.log(max(interaction, _LEAST_RATIO)) * (a / max(below, _LEAST_FREE)))
+        improved = below - below * share
+    approach = at_least(closing, ZERO)
+    heuristic = -(approach * approach) / (max(gap, NEAREST) * TWO)
+    less = improved - heuristic
+    if less < ZERO:
+        milder = math.tanh(less / comfortable) * comfortable + heuristic
+        improved += coolness * (milder - improved)
+    return clip(improved, -idm.max_deceleration, a)
 
 
 @compiled

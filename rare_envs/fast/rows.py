@@ -15,6 +15,8 @@ from rare_envs.fast import equations as eq
 from rare_envs.fast.equations import IDMNumbers, RoadNumbers, compiled, inlined, single
 from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
+from rare_envs.scenarios.cut_in import OVER_THE_LINE, CutterModel
+from rare_envs.traffic.state import VEHICLE_LENGTH
 
 SingleArray: TypeAlias = NDArray[np.float32]
 OWN = 8
@@ -22,13 +24,39 @@ OWN = 8
 HIT, UNKNOWN, _LARGEST, _NOWHERE = single(COLLISION, -np.inf, TTC_MAX, np.inf)
 
 
+class CutterNumbers(NamedTuple):
+    """A `CutterModel`, in single precision."""
+
+    comfortable: float
+    """b of its IDM [m/s^2]."""
+    coolness: float
+    """Of the heuristic; -1 for the IDM alone."""
+    patience: float
+    """Ticks from a place being taken to turning back."""
+    most_braking: float
+    """That it expects of the ego [m/s^2]."""
+    reach: float
+    """Distance of centres along the road within which the ego is beside it [m]."""
+    line: float
+    """y at which its body is over the line [m]."""
+
+    @classmethod
+    def of(cls, model: CutterModel, dt: float) -> "CutterNumbers":
+        """Return the numbers of a model and a tick [s]."""
+        reach, coolness = VEHICLE_LENGTH + model.margin, -1.0 if model.coolness is None else model.coolness
+        own = (model.idm.comfortable_deceleration, coolness, model.ticks_to_turn(dt), model.most_braking)
+        return cls(*single(*own, reach, OVER_THE_LINE))
+
+
 class ScriptNumbers(NamedTuple):
     """How the vehicles around the ego move, and where."""
 
     number: int
-    """`STEADY`, `BRAKING` or `CUT_IN`."""
+    """`STEADY`, `BRAKING`, `CUT_IN` or `HUMAN_CUT_IN`."""
     cutter_idm: IDMNumbers
     """Of a cutter behind its lead."""
+    cutter: CutterNumbers
+    """The rest of one that drives as people do."""
     road: RoadNumbers
     dt: float
     """Tick [s]."""
@@ -87,8 +115,8 @@ def rows_of(table: SingleArray, vehicles: int, size: int) -> Rows:
     )
 
 
-STEADY, BRAKING, CUT_IN = range(3)
-"""Numbers of scripts: a lead that keeps its speed, one that brakes, and a cutter in front of a lead."""
+STEADY, BRAKING, CUT_IN, HUMAN_CUT_IN = range(4)
+"""Numbers of scripts: a lead that keeps its speed, one that brakes, a cutter in front of a lead, and one that looks."""
 
 
 @inlined
@@ -97,6 +125,8 @@ def move_others(rows: Rows, script: ScriptNumbers) -> None:
     x, speed, dt = rows.x[1], rows.speed[1], script.dt
     if script.number == CUT_IN:
         cut_in(rows, script.cutter_idm, dt)
+    elif script.number == HUMAN_CUT_IN:
+        human_cut_in(rows, script.cutter_idm, script.cutter, dt)
     elif script.number == BRAKING:
         start, loss, lasting, time = rows.theta[0], rows.theta[1], rows.theta[2], rows.theta[3]
         for row in range(rows.size):
@@ -127,9 +157,70 @@ def cut_in(rows: Rows, idm: IDMNumbers, dt: float) -> None:
         y[row], slope[row] = bezier(x[row] - start[row], length[row], offset[row])
         bends |= (slope[row] != eq.ZERO) | (heading[row] != eq.ZERO)
     if bends:
-        for row in range(rows.size):
-            heading[row] = slope[row] if slope[row] == eq.ZERO else math.atan(slope[row])
-            cos[row] = eq.cosine(heading[row])
+        turn_cutters(rows)
+
+
+@inlined
+def turn_cutters(rows: Rows) -> None:
+    """Let cutters head along slopes, which stand in `spare`."""
+    heading, cos, slope = rows.heading[1], rows.cosine[1], rows.spare[0]
+    for row in range(rows.size):
+        heading[row] = slope[row] if slope[row] == eq.ZERO else math.atan(slope[row])
+        cos[row] = eq.cosine(heading[row])
+
+
+_INFINITE = np.float32(np.inf)
+
+
+@inlined
+def human_cut_in(rows: Rows, idm: IDMNumbers, model: CutterNumbers, dt: float) -> None:
+    """Move cutter and lead: `rare_envs.scenarios.cut_in.CutterModel.others`; theta has the columns of `CutInTheta`."""
+    ego_x, ego_speed = rows.x[0], rows.speed[0]
+    x, y, heading, speed, cos = rows.x[1], rows.y[1], rows.heading[1], rows.speed[1], rows.cosine[1]
+    lead_x, lead_speed, slope = rows.x[2], rows.speed[2], rows.spare[0]
+    lead_y, lead_heading, lead_cos = rows.y[2], rows.heading[2], rows.cosine[2]
+    length, offset, desired_speed, delay = rows.theta[0], rows.theta[1], rows.theta[2], rows.theta[3]
+    first_speed, onset, lasting, loss = rows.theta[5], rows.theta[6], rows.theta[7], rows.theta[8]
+    time, way, waited, over, turned = rows.theta[9], rows.theta[10], rows.theta[11], rows.theta[12], rows.theta[13]
+    bends = False
+    for row in range(rows.size):
+        gap, closing = lead_x[row] - x[row] - eq.BODY_LENGTH, speed[row] - lead_speed[row] * cos[row]
+        ratio = speed[row] / desired_speed[row]
+        if model.coolness < eq.ZERO:
+            free = eq.fourth_power(ratio) if idm.exponent == eq.FOUR else ratio**idm.exponent
+            acceleration = eq.idm_acceleration(idm, speed[row], gap, closing, ratio, free)
+        else:
+            acceleration = eq.improved_acceleration(
+                idm, model.comfortable, model.coolness, speed[row], gap, closing, ratio
+            )
+        distance, approach = x[row] - ego_x[row], eq.at_least(ego_speed[row] - speed[row], eq.ZERO)
+        behind = distance - eq.BODY_LENGTH
+        needed = approach * approach / (eq.TWO * eq.at_least(behind, eq.NEAREST))
+        pressed = (behind >= eq.ZERO) & (needed > model.most_braking)
+        if over[row] >= eq.ZERO:
+            over[row] += eq.ONE
+        elif y[row] < model.line:
+            over[row] = eq.ZERO
+        sees = over[row] * dt >= delay[row]
+        taken = (way[row] < length[row]) & sees & ((abs(distance) < model.reach) | pressed)
+        patience = model.patience if delay[row] == -_INFINITE else eq.ZERO
+        back = taken & (waited[row] >= patience)
+        waited[row] = waited[row] + eq.ONE if taken else eq.ZERO
+        turned[row] = eq.ONE if back else turned[row]
+        ahead = speed[row] * cos[row] * dt
+        after = eq.at_least(way[row] - ahead if back else way[row] + ahead, eq.ZERO)
+        way[row] = min(after, length[row])
+        x[row] += ahead
+        speed[row] = eq.at_least(speed[row] + acceleration * dt, eq.ZERO)
+        time[row] += dt
+        lead_x[row] += lead_speed[row] * dt
+        lead_speed[row] = first_speed[row] - loss[row] * eq.lost_share(time[row] - onset[row], lasting[row])
+        lead_y[row], lead_heading[row], lead_cos[row] = eq.ZERO, eq.ZERO, eq.ONE
+        y[row], slope[row] = bezier(way[row], length[row], offset[row])
+        slope[row] = -slope[row] if back else slope[row]
+        bends |= (slope[row] != eq.ZERO) | (heading[row] != eq.ZERO)
+    if bends:
+        turn_cutters(rows)
 
 
 @compiled

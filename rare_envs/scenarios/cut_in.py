@@ -145,8 +145,15 @@ ATTENTION_LIMIT: Final = float(ndtri(UNSEEN_SHARE))
 """Cutters with an `attention` below it have not looked."""
 
 
-class _Theta(NamedTuple):
-    """Columns of theta in `CutIn-v1`, (B,) each: parameters, and behind them the script's memory."""
+class CutInTheta(NamedTuple):
+    """Columns of theta in `CutIn-v1`, (B,) each: parameters, and behind them the script's memory.
+
+    Example:
+        >>> from rare_envs.scenarios import scenario_named
+        >>> x = torch.tensor([[20.0, 20.0, 20.0, -3.0, 50.0, 3.5, 4.0, *6 * [0.0]]])  # the cutter beside the ego
+        >>> CutInTheta(*scenario_named("cut_in").initial(x).theta.unbind(1)).length.tolist()
+        [80.0]
+    """
 
     length: Tensor
     """Of the cutter's path along the road [m]."""
@@ -249,7 +256,7 @@ class CutterModel:
         )
 
     def initial(self, x: Tensor) -> State:
-        """Place ego and lead in one lane and the cutter beside them; columns of theta as in `_Theta`."""
+        """Place ego and lead in one lane and the cutter beside them; columns of theta as in `CutInTheta`."""
         cut_in_speed, lead_speed, offset = x[:, 1], x[:, 2], x[:, 5]
         duration, attention, noticing, indicator, braking, peak, loss = x[:, 6:].unbind(dim=1)
         (limit, oblivious, indicating) = scalars(
@@ -264,7 +271,7 @@ class CutterModel:
         loss = torch.minimum(torch.exp(self.loss[0] + self.loss[1] * loss), lead_speed)
         zero, brakes = torch.zeros_like(offset), rank < 1.0
         state = _start(x)
-        theta = _Theta(
+        theta = CutInTheta(
             length=(cut_in_speed * duration).clamp(min=CUT_IN_MIN_LENGTH),
             offset=offset,
             desired_speed=cut_in_speed.clamp(min=1.0),
@@ -284,7 +291,7 @@ class CutterModel:
 
     def others(self, state: State, dt: float) -> Others:
         """Move the lead, which keeps its speed or brakes once, and the cutter behind and in front of it."""
-        theta = _Theta(*state.theta.unbind(dim=1))
+        theta = CutInTheta(*state.theta.unbind(dim=1))
         (x, _, heading, speed), (lead_x, _, _, lead_speed) = state.vehicles[1:]
         tick, body = scalars((dt, VEHICLE_LENGTH), x)
         lead = Lead(lead_x - x - body, speed - lead_speed * torch.cos(heading))
@@ -299,21 +306,26 @@ class CutterModel:
     def driven(self, state: State, action: Tensor, dt: float) -> Others:
         """Move both with the accelerations of their drivers; across the cutter goes on and turns back by itself."""
         speed = (state.speed[:, 1:] + action[..., 0] * dt).clamp(min=0.0)
-        return self._advance(state, _Theta(*state.theta.unbind(dim=1)), speed[:, 0], speed[:, 1], dt)
+        return self._advance(state, CutInTheta(*state.theta.unbind(dim=1)), speed[:, 0], speed[:, 1], dt)
 
-    def _advance(self, state: State, theta: _Theta, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
+    def ticks_to_turn(self, dt: float) -> float:
+        """Return the reaction time in ticks of dt [s]."""
+        return float(round(self.reaction_time / dt))
+
+    def _advance(self, state: State, theta: CutInTheta, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
         """Return both after the tick with new speeds (B,): the cutter on its path or on the way back."""
         x, lead_x = _move_along(state, dt)
         theta, back = self._decide(state, theta, dt)
-        ahead = x - state.vehicles[1].x
+        (tick,), (_, _, heading, old_speed) = scalars((dt,), x), state.vehicles[1]
+        ahead = old_speed * torch.cos(heading) * tick
         way = theta.way + torch.where(back, -ahead, ahead)
         way = torch.minimum(way.clamp_min(0.0), theta.length)
         y, slope = bezier(way, theta.length, theta.offset)
         heading = torch.atan(torch.where(back, -slope, slope))
-        theta = theta._replace(time=theta.time + scalars((dt,), x)[0], way=way)
+        theta = theta._replace(time=theta.time + tick, way=way)
         return _place(x, lead_x, y, heading, speed, lead_speed)._replace(theta=columns(*theta))
 
-    def _decide(self, state: State, theta: _Theta, dt: float) -> tuple[_Theta, Tensor]:
+    def _decide(self, state: State, theta: CutInTheta, dt: float) -> tuple[CutInTheta, Tensor]:
         """Return what the cutter remembers after it has looked or not, and whether it goes back, boolean (B,)."""
         ego, cutter = state.vehicles[:2]
         (tick,) = scalars((dt,), cutter.x)
@@ -324,7 +336,7 @@ class CutterModel:
         over = torch.where(theta.over < 0.0, torch.where(cutter.y < OVER_THE_LINE, 0.0, theta.over), theta.over + 1.0)
         crossing, sees = theta.way < theta.length, over * tick >= theta.delay
         taken = crossing & sees & (beside | pressed)
-        patience = torch.where(torch.isneginf(theta.delay), float(round(self.reaction_time / dt)), 0.0)
+        patience = torch.where(torch.isneginf(theta.delay), self.ticks_to_turn(dt), 0.0)
         back = taken & (theta.waited >= patience)
         waited = torch.where(taken, theta.waited + 1.0, 0.0)
         turned = torch.where(back, 1.0, theta.turned)
@@ -337,14 +349,14 @@ OVER_THE_LINE = LANE_WIDTH / 2 + VEHICLE_WIDTH / 2
 
 def signals(state: State) -> Tensor:
     """Return which of cutter and lead have their indicator on towards the ego's lane, boolean, (B, 2): no lead."""
-    theta = _Theta(*state.theta.unbind(dim=1))
+    theta = CutInTheta(*state.theta.unbind(dim=1))
     on = (theta.indicates > 0.0) & (theta.way < theta.length)
     return torch.stack((on, torch.zeros_like(on)), dim=1)
 
 
 def evades(state: State) -> Tensor:
     """Return whether the cutter, not having looked, has turned back by now, boolean, (B,)."""
-    theta = _Theta(*state.theta.unbind(dim=1))
+    theta = CutInTheta(*state.theta.unbind(dim=1))
     return (theta.turned > 0.0) & ~torch.isneginf(theta.delay)
 
 

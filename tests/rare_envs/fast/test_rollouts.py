@@ -17,7 +17,7 @@ from rare_envs import IDM
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.traffic.road import Road, straight
 
-SCENARIOS = ("CarFollowing-v0", "CutIn-v0", "HardBrake-v0")
+SCENARIOS = ("CarFollowing-v0", "CutIn-v0", "CutIn-v1", "HardBrake-v0")
 EGOS = {"HardBrake-v0": IDM(max_deceleration=2.0)}  # the usual one hits no lead that brakes in a parabola
 FEW = 200
 
@@ -33,7 +33,10 @@ def problems(env_id: str, ego: Any = "idm", **kwargs: Any) -> list[rare_envs.Dri
 def points(problem: rare_envs.DrivingProblem, n: int) -> Any:
     """Half of ordinary traffic, half anywhere in the physical box."""
     rng, space = np.random.default_rng(11), problem.space
-    anywhere = np.array(space.low) + (np.array(space.high) - np.array(space.low)) * rng.random((n // 2, space.dim))
+    bounded = np.isfinite(space.high)
+    low, high = (np.where(bounded, end, 0.0) for end in (space.low, space.high))
+    anywhere = low + (high - low) * rng.random((n // 2, space.dim))
+    anywhere[:, ~bounded] = rng.normal(0.0, 4.0, (n // 2, (~bounded).sum()))  # so that some have not looked
     return np.concatenate([problem.base.sample(n - n // 2, rng), anywhere])
 
 
