@@ -87,9 +87,8 @@ def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np
     with torch.inference_mode():
         state = world.scenario.initial(torch.from_numpy(x).float())
     try:
-        f: NDArray[np.float64] = compiled.drive(
-            script, state, ego, world.scenario.road, world.clock.dt, world.clock.ticks
-        )
+        numbers = compiled.numbers_of(*script, world.scenario.road, world.clock.dt)
+        f: NDArray[np.float64] = compiled.drive(numbers, state, ego, world.clock.ticks)
     except Exception as error:  # numba compiles at the first call, where anything may be raised
         raise CompilerFails(f"numba fails here: {one_line(error)}") from error
     return f
@@ -157,7 +156,7 @@ class ScriptedStep:
                 f"the action {world.clock.action!r} is": world.clock.action == "meta",
             }
         )
-        self._numbers = import_compiler().numbers_of(script, world.scenario.road, world.clock.dt)
+        self._numbers = import_compiler().numbers_of(*script, world.scenario.road, world.clock.dt)
 
     def advance(self, episode: Episode, physical: Tensor) -> StepResult | None:
         """Carry out accelerations [m/s^2] and steering angles [rad] of the egos (B, 2) for a tick.

@@ -13,11 +13,11 @@ from rare_envs.control.idm import IDM
 from rare_envs.egos.dense_policies import DensePolicy
 from rare_envs.fast import equations as eq
 from rare_envs.fast import rows as fast_rows
-from rare_envs.fast.choice import Script
 from rare_envs.fast.equations import IDMNumbers, RoadNumbers, compiled, single
 from rare_envs.fast.networks import LANES, PolicyNumbers, decide_by_policy, observe
 from rare_envs.fast.rows import (
     HIT,
+    HUMAN_CUT_IN,
     OWN,
     UNKNOWN,
     CutterNumbers,
@@ -31,7 +31,7 @@ from rare_envs.fast.rows import (
     tick,
 )
 from rare_envs.measures.base import COLLISION
-from rare_envs.scenarios.cut_in import CUTTER_IDM
+from rare_envs.scenarios.cut_in import CUTTER_IDM, CutterModel
 from rare_envs.simulation import decision as reward
 from rare_envs.simulation.decision import RewardTerms, StepResult
 from rare_envs.simulation.episode import Episode, EpisodeStatistics
@@ -60,20 +60,17 @@ _STANDING_GAP, _TIME_GAP, _COST, _LEAST_CLOSING = single(
 
 
 @lru_cache
-def numbers_of(script: Script, road: Road, dt: float) -> ScriptNumbers:
-    """Return the numbers of a script on a straight road with equal lanes."""
-    number: int = getattr(fast_rows, script.name)
-    idm = IDMNumbers.of(CUTTER_IDM if script.name == "CUT_IN" else script.cutter.idm)
-    return ScriptNumbers(number, idm, CutterNumbers.of(script.cutter, dt), RoadNumbers.of(road), *single(dt))
+def numbers_of(script: str, cutter: CutterModel, road: Road, dt: float) -> ScriptNumbers:
+    """Return the numbers of a script, named as in `rare_envs.fast.rows`, on a straight road with equal lanes."""
+    number: int = getattr(fast_rows, script)
+    idm = IDMNumbers.of(cutter.idm if number == HUMAN_CUT_IN else CUTTER_IDM)
+    return ScriptNumbers(number, idm, CutterNumbers.of(cutter, dt), RoadNumbers.of(road), *single(dt))
 
 
-def drive(
-    script: Script, state: State, ego: IDM | DensePolicy, road: Road, dt: float, ticks: int
-) -> NDArray[np.float64]:
+def drive(numbers: ScriptNumbers, state: State, ego: IDM | DensePolicy, ticks: int) -> NDArray[np.float64]:
     """Return f (B,) of scenarios from their state at time 0, NaN where a policy's outputs are not finite."""
     start, vehicles, f = stack_state(state), state.x.shape[1], np.full(len(state.x), np.inf, dtype=np.float32)
     table = make_table(start, vehicles, min(ROWS, max(len(f), 1)) if isinstance(ego, IDM) else LANES)
-    numbers = numbers_of(script, road, dt)
     if isinstance(ego, IDM):
         drive_by_idm(start, table, vehicles, IDMNumbers.of(ego), numbers, ticks, f)
     else:

@@ -389,7 +389,7 @@ class World:
 
     def _moment(self, state: State, road: Road, perception: Tensor | None, before: State | None) -> Moment:
         """Return the moment of a state, with others' evasions if the measure counts them."""
-        evades = getattr(self.scenario, "evades", None) if self.measurement.episode_measure.twice else None
+        evades = self.scenario.evades if self.measurement.episode_measure.twice else None
         evading = None if evades is None else evades(state)
         return Moment(state, lead_of(state, road), road, perception, before, self.clock.dt, evading)
 
