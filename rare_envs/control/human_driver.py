@@ -236,11 +236,15 @@ SEEN_WIDTH = 1.8
 """Width of a car as it is seen from behind [m], assumed."""
 
 
+NOBODY = 1e9
+"""Distance of nobody [m]: finite, so that there are gradients."""
+
+
 class Ahead(NamedTuple):
     """The nearest noticed vehicle ahead of B drivers, shape (B,) each; only the gap has a meaning for nobody."""
 
     gap: Tensor
-    """Bumper to bumper [m], negative side by side, inf for nobody."""
+    """Bumper to bumper [m], negative side by side, about `NOBODY` for nobody."""
     speed: Tensor
     """Of the vehicle along the driver's heading [m/s]."""
     acceleration: Tensor
@@ -250,7 +254,7 @@ class Ahead(NamedTuple):
 def find_ahead(state: State, noticed: Tensor, before: Tensor, dt: float) -> Ahead:
     """Return the nearest ahead of the V other vehicles that are noticed, with their speeds a tick before; (B, V)."""
     ahead = state.x[:, 1:] - state.x[:, :1]
-    distance, nearest = torch.where(noticed & (ahead >= 0.0), ahead, torch.inf).min(dim=1)
+    distance, nearest = torch.where(noticed & (ahead >= 0.0), ahead, NOBODY).min(dim=1)
     which = nearest[:, None]
     speed, heading, former = (
         each.gather(1, which)[:, 0] for each in (state.speed[:, 1:], state.heading[:, 1:], before)

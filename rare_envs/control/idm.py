@@ -174,8 +174,9 @@ def improved_acceleration(
 
         improved: a_f = a (1 - (v/v0)^delta), z = s*/s;  a (1 - z^2) if z >= 1, else a_f (1 - z^(2 a / a_f));
                   above v0: a_f = -b (1 - (v0/v)^(a delta / b));  a_f + a (1 - z^2) if z >= 1, else a_f
-        heuristic: a~ = min(a_lead, a);  v^2 a~ / (v_lead^2 - 2 s a~) if v_lead dv <= -2 s a~, else
-                  a~ - max(dv, 0)^2 / (2 s)
+        heuristic: a~ = min(a_lead, a), v_lead = max(v - dv, 0);
+                  v^2 a~ / (v_lead^2 - 2 s a~) if v_lead dv < -2 s a~, else
+                  a~ - max(dv, 0)^2 / (2 s): behind a lead that stands both say -v^2 / (2 s)
         both:     the improved one where it is the larger, else (1 - c) improved + c (heuristic + b tanh((improved -
                   heuristic) / b))
 

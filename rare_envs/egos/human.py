@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.human_driver import (
+    NOBODY,
     Ahead,
     Glances,
     HumanDriverModel,
@@ -215,7 +216,7 @@ class HumanDriver:
         nothing = torch.zeros_like(state.speed[:, 0])
         since, none = torch.where(beside, -1, _ALWAYS), torch.zeros_like(nothing, dtype=torch.int64)
         glance = _Glance(none, torch.zeros_like(episode.collided), torch.full_like(nothing, torch.inf))
-        nobody = Ahead(torch.full_like(nothing, torch.inf), nothing, nothing)
+        nobody = Ahead(torch.full_like(nothing, NOBODY), nothing, nothing)
         return _HumanMemory(0, zone, beside, since, state.speed[:, 1:], (), glance, nobody, none)
 
     def _look(self, episode: Episode, memory: _HumanMemory) -> tuple[_Sight, Tensor]:

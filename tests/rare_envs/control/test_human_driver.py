@@ -13,6 +13,7 @@ from rare_envs.control.human_driver import (
     LAMBLE_ECCENTRICITIES,
     MEAN_GLANCE,
     MEAN_ON_ROAD,
+    NOBODY,
     OFF_ROAD_SHARE,
     Ahead,
     Glances,
@@ -51,9 +52,9 @@ def test_errors_have_variance_one_and_the_published_correlation_time() -> None:
 
 
 def test_gap_and_speed_difference_are_misjudged_as_published() -> None:
-    ahead = Ahead(tensor(20.0, math.inf), tensor(12.0, 3.0), tensor(0.0, 0.0))
+    ahead = Ahead(tensor(20.0, NOBODY), tensor(12.0, 3.0), tensor(0.0, 0.0))
     lead = estimate(ahead, tensor(15.0, 15.0), tensor(1.0, -2.0)[None], MODEL)
-    assert lead.gap.tolist() == pytest.approx([20.0 * math.exp(0.1), math.inf])
+    assert lead.gap.tolist() == pytest.approx([20.0 * math.exp(0.1), NOBODY * math.exp(0.1)])
     assert lead.closing_speed[0].item() == pytest.approx(3.0 - 2.0 * 0.01 * 20.0)
 
 
@@ -63,7 +64,7 @@ def test_the_nearest_that_is_noticed_and_ahead_is_followed() -> None:
     noticed, before = torch.tensor([[True, True, False, True]]), speed[:, 1:] + 0.2
     ahead = find_ahead(state, noticed, before, 0.1)
     assert [each.item() for each in ahead] == pytest.approx([25.0, 10.0, -2.0])
-    assert find_ahead(state, noticed & (x[:, 1:] < 0.0), before, 0.1).gap.item() == math.inf
+    assert find_ahead(state, noticed & (x[:, 1:] < 0.0), before, 0.1).gap.item() > 1e6
 
 
 def test_a_lead_is_braked_for_by_the_heuristic_until_its_braking_is_seen() -> None:
@@ -76,6 +77,15 @@ def test_a_lead_is_braked_for_by_the_heuristic_until_its_braking_is_seen() -> No
         found = respond(lead, tensor(lead_acceleration), speed, model).item()
         assert found == pytest.approx(expected, abs=1e-9)
     assert respond(lead, tensor(-0.51), speed, model).item() == -5.0
+
+
+def test_a_driver_with_nobody_ahead_accelerates_freely_whatever_its_errors() -> None:
+    """a (1 - (v / v0)^4), with a slope in the errors that is 0 and no NaN."""
+    errors = tensor(3.0, -3.0)[None].requires_grad_()
+    lead = estimate(Ahead(tensor(NOBODY), tensor(40.0), tensor(-9.0)), tensor(20.0), errors, MODEL)
+    acceleration = respond(lead, tensor(0.0), tensor(20.0), MODEL)
+    assert acceleration.item() == pytest.approx(1 - (20 / (120 / 3.6)) ** 4, abs=1e-9)
+    assert torch.autograd.grad(acceleration, errors)[0].abs().max().item() < 1e-9
 
 
 def test_a_standing_lead_is_not_run_into() -> None:
