@@ -1,21 +1,29 @@
-"""Does an attentive human driver collide as rarely as people do? Base distributions against the 100-Car study.
+"""Do simulated people crash and nearly crash as often as people do? Per kind of event, against the 100-Car study.
 
-    python -m benchmarks.driving.human_calibration [--base CutIn=i80] [--draws 200000]
+    python -m benchmarks.driving.human_calibration [--draws 1000000] [--workers 2] [--ego ppo.zip]
 
-drives draws of each base distribution with the human driver model, with parts of it taken away, with `idm`, and with
-one that brakes fully from the first moment on; counts contacts and near-crashes (`near_crash`); compares them with
-people per event and per km; says what is off; and writes benchmarks/results/human_calibration.json and the end of
-docs/human_driver.md. People's counts are those of `rare_envs.exposure.HUMAN_BENCHMARKS`, how often the events happen is
-the `EventFrequency` of the base distribution.
+drives draws of each stratum (cutters who looked, cutters who did not, leads that stop, leads that slow) with the human
+driver model, its bracket, the IDM and the shipped egos, and counts contacts and near-crashes (`near_crash`); takes away
+parts of the model one at a time; compares per event and per million km with people's counts by precipitating event
+(`rare_envs.exposure.people_in`); and says which targets are met. It writes benchmarks/results/human_calibration.json,
+rare_envs/data/human_calibration.json (what the package prints beside rates) and the end of docs/human_driver.md.
+
+People's counts are those of all roads; how often the events happen is the `EventFrequency` of the base distribution. No
+constant of the model or of the scenarios may be changed because of what is printed here without saying so on the page.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,253 +31,393 @@ import typer
 from torch import Tensor
 
 import rare_envs
+import rare_envs.exposure
+from agents import load_ego
 from benchmarks import RESULTS
-from rare_envs.control.human_driver import MAX_HUMAN_BRAKING, HumanDriverModel
-from rare_envs.distributions import EventFrequency, FittedDistribution
-from rare_envs.egos.human import HumanEgo
-from rare_envs.exposure import (
-    CUT_IN_CONTACTS_100CAR,
-    CUT_IN_NEAR_CRASHES_100CAR,
-    MILLION_KM,
-    REAR_END_CONTACTS_100CAR,
-    REAR_END_NEAR_CRASHES_100CAR,
-    HumanBenchmark,
-)
-from rare_envs.measures import find_measure
-from rare_envs.measures.longitudinal import MAX_BRAKING, RAPID_BRAKING
-from rare_envs.measures.registry import Combined
-from rare_envs.scenarios import load_base
-from rare_envs.scenarios.registry import find_scenario
-from rare_envs.startup import use_one_thread
-from samplers.sample import Interval, clopper_pearson
+from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.egos.human import HUMAN_EGOS, HumanEgo
+from rare_envs.exposure import MILLION_KM, Event, EventCalibration, ModelCount, Outcome, people_in
+from rare_envs.measures.registry import NearCrash, NearCrashState
+from rare_envs.scenarios.base import load_base
+from rare_envs.scenarios.cut_in import UNSEEN_SHARE, CutterModel
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
+from samplers.sample import clopper_pearson
 
 CALIBRATION_RESULT = RESULTS / "human_calibration.json"
+CALIBRATION_OF_PACKAGE = Path(rare_envs.exposure.__file__).parent / "data" / "human_calibration.json"
 PAGE, MEASURED = Path("docs/human_driver.md"), "## Measured"
 CONFIDENCE = 0.95
-CONTACT = -100.0
-"""f of `near_crash` in a collision."""
-SAFE, NEAR_CRASH, NEEDED, TOUCHED = 0.0, 1.0, 2.0, 3.0
-"""Outcomes of a drive: nothing, a near-crash, one in which avoiding a contact took more than 0.5 g, a contact."""
-HUMAN = HumanDriverModel()
+CUT_IN, HARD_BRAKE = "rare_envs/CutIn-v1", "rare_envs/HardBrake-v0"
+HUMAN, BRACKET = "human", "human:no-headway-rule"
 
 
-class FullBraking:
-    """An ego that brakes as hard as a human can from the first moment on: nobody can do more without steering."""
-
-    def act(self, episode: Any, memory: Any) -> tuple[Tensor, Any]:
-        """Return the hardest braking, straight ahead."""
-        return torch.tensor([-MAX_HUMAN_BRAKING, 0.0]).expand(len(episode.collided), 2), memory
-
-
-DRIVERS: Mapping[str, Any] = {
-    "human": HumanEgo(HUMAN),
-    "human without glances": HumanEgo(replace(HUMAN, glances=False)),
-    "human without glances, reacting at once": HumanEgo(
-        replace(HUMAN, glances=False, reaction_time=0.0, noticing_time=0.0)
-    ),
-    "idm": "idm",
-    "full braking at once": FullBraking(),
-}
-
-
-@dataclass(frozen=True)
-class HumanEvents:
-    """Events of a kind, and what people's contacts and near-crashes in them are counted as."""
+class Stratum(NamedTuple):
+    """Events of one kind, a stratum of a base distribution."""
 
     env_id: str
-    name: str
-    contacts: HumanBenchmark
-    near_crashes: HumanBenchmark
-
-    def find_frequency(self, base: str | None) -> EventFrequency:
-        """Return how often the events of a base distribution happen.
-
-        Raises:
-            ValueError: If nobody counted.
-        """
-        found = load_base(find_scenario(self.env_id), base)
-        if not isinstance(found, FittedDistribution) or found.frequency is None:
-            raise ValueError(f"The base {base!r} of {self.env_id} has no event frequency.")
-        return found.frequency
+    event: Event
+    words: str
+    share: float
+    """Of the draws that are asked for, what it gets: where contacts are one in a hundred, fewer do."""
 
 
-EVENTS = (
-    HumanEvents("rare_envs/CutIn-v1", "cut-in", CUT_IN_CONTACTS_100CAR, CUT_IN_NEAR_CRASHES_100CAR),
-    # all of people's rear-end contacts are taken to begin with brakings of the base's kind, those to a standstill
-    HumanEvents(
-        "rare_envs/HardBrake-v0", "braking of the lead", REAR_END_CONTACTS_100CAR, REAR_END_NEAR_CRASHES_100CAR
-    ),
-)
+STRATA: Mapping[str, Stratum] = {
+    "looked": Stratum(CUT_IN, "cut_in", "cutters who looked", 1.0),
+    "unseen": Stratum(CUT_IN, "cut_in", "cutters who had not looked", 0.1),
+    "stop": Stratum(HARD_BRAKE, "stop", "leads that stop", 1.0),
+    "slowing": Stratum(HARD_BRAKE, "slowing", "leads that slow", 1.0),
+}
+WITHIN: Mapping[Event, float] = {"cut_in": 3.0, "stop": 3.0, "slowing": 5.0}
+"""Factors within which `human` has to meet people's intervals."""
 
 
-def count_per_event(people: HumanBenchmark, frequency: EventFrequency) -> Interval:
-    """Return how often people have such an outcome per event, with the exact interval of their count."""
-    low, high = people.interval_per_million_km
-    return low / MILLION_KM / frequency.per_km, high / MILLION_KM / frequency.per_km
+class Change(NamedTuple):
+    """One part of the driver, of the cutter or of the base taken away or changed, all else as it is."""
+
+    strata: tuple[str, ...]
+    """Where it matters."""
+    driver: Mapping[str, Any] = {}
+    """Fields of `HumanDriverModel`."""
+    cutter: Mapping[str, Any] = {}
+    """Fields of `CutterModel`."""
+    base: str = ""
+    """Ending of the base distribution's name."""
+
+
+_CUT_INS, _BRAKES = ("looked", "unseen"), ("stop", "slowing")
+CHANGES: Mapping[str, Change] = {
+    "": Change(tuple(STRATA)),
+    "no glances": Change(("looked", *_BRAKES), {"glances": False}),
+    "no headway rule for glances": Change(("looked", *_BRAKES), {"headway_rule": False}),
+    "glances not broken off by looming": Change(_BRAKES, {"glance_eccentricity": 180.0}),
+    "glances begun whatever closes": Change(_BRAKES, {"glance_looming": math.inf}),
+    "no headway rule, glances not broken off": Change(_BRAKES, {"headway_rule": False, "glance_eccentricity": 180.0}),
+    "no constant-acceleration heuristic": Change(("looked", *_BRAKES), {"coolness": 0.0}),
+    "the heuristic behind brake lights too": Change(_BRAKES, {"brake_light": math.inf}),
+    "no evasive steering": Change(_CUT_INS, {"evasive_share": 0.0}),
+    "indicators not noticed": Change(("looked",), {"notice_indicator": False}),
+    "every change indicated": Change(("looked",), {}, {"indicating": 1.0}),
+    "the cutter never looks": Change(("looked",), {}, {"looks": False}),
+    "it turns back above 4 m/s^2, not 2": Change(("looked",), {}, {"most_braking": 4.0}),
+    "the cutter follows its lead by IDM": Change(("looked",), {}, {"coolness": None}),
+    "the lead keeps its speed": Change(("looked",), {}, {"brakings_per_km": 0.0}),
+    "gaps that nobody accepts": Change(("looked",), {}, {}, "-test"),
+    "gaps that nobody accepts, never looks": Change(("looked",), {}, {"looks": False}, "-test"),
+    "noticed after 0.01 s": Change(("unseen",), {}, {"noticing": 0.01}),
+    "noticed after 0.25 s": Change(("unseen",), {}, {"noticing": 0.25}),
+    "noticed after 1 s": Change(("unseen",), {}, {"noticing": 1.0}),
+    "never noticed": Change(("unseen",), {}, {"oblivious": 1.0}),
+}
+"""Parts by name; "" is the model as it is. Of a change other than it, `CHANGED_SHARE` of the draws are driven."""
+CHANGED_SHARE = 0.2
+EGOS: Mapping[str, float] = {HUMAN: 1.0, BRACKET: 1.0, "idm": 1.0, "imitation": 0.01, "vision": 0.002}
+"""Egos, and their share of the draws: networks are slow, cameras slower."""
+OWN_EGO_SHARE = 0.02
+CHUNK = 20_000
+
+
+class Drawn(NamedTuple):
+    """What is driven: draws of one stratum of a site, with one ego and one change."""
+
+    site: str
+    stratum: str
+    ego: str
+    change: str = ""
+
+
+class Job(NamedTuple):
+    """A part of the draws of a cell, which is the same whoever drives it."""
+
+    drawn: Drawn
+    part: int
+    size: int
+    seed: int
+
+
+NOTHING, RAPID, COUNTER, EVADED, CONTACT = range(5)
+"""Outcomes: nothing rapid; a rapid manoeuvre that nobody needed; a near-crash, since without it there is a contact; a
+near-crash, since a cutter that had not looked turns back; a contact."""
+
+
+class OutcomeMeasure(NearCrash):
+    """The outcome of a drive as f: large is dangerous here."""
+
+    def f(self, state: NearCrashState) -> Tensor:
+        """Return the outcome, shape (B,)."""
+        outcome = torch.where(state.rapid >= 1.0, float(RAPID), float(NOTHING))
+        outcome = torch.where(state.ttc <= 0.0, float(COUNTER), outcome)
+        return torch.where(state.collided, float(CONTACT), torch.where(state.evaded, float(EVADED), outcome))
 
 
 @dataclass(frozen=True)
 class CalibrationCell:
-    """One driver in one kind of event."""
+    """Outcomes of the draws of one stratum with one ego and one change."""
 
-    event: str
-    driver: str
-    base: str
+    site: str
+    stratum: str
+    ego: str
+    change: str
     draws: int
+    rapid: int
+    """Rapid manoeuvres that nobody needed."""
+    counter: int
+    """Near-crashes: without the ego's rapid manoeuvre there is a contact."""
+    evaded: int
+    """Near-crashes: the cutter, which had not looked, turns back."""
     contacts: int
-    near_crashes: int
-    """Episodes with a rapid evasive manoeuvre and without contact."""
-    needed: int
-    """... of these, with a moment at which avoiding a contact takes more than 0.5 g."""
     flanks: int
     """Contacts of flank against flank."""
 
-    def interval(self, count: int) -> tuple[float, float]:
-        """Return the exact interval of the probability of what was counted."""
-        return clopper_pearson(count, self.draws, CONFIDENCE)
+    @property
+    def near_crashes(self) -> int:
+        """Near-crashes of either kind."""
+        return self.counter + self.evaded
+
+    def probability(self, count: int) -> ModelCount:
+        """Return the probability of what was counted, with its exact interval."""
+        return ModelCount(count / self.draws, *clopper_pearson(count, self.draws, CONFIDENCE))
 
 
-def classify_outcomes(f: Tensor) -> Tensor:
-    """Return the outcome of drives from f of `near_crash` and of `required_deceleration`, shapes (2, B) and (B,)."""
-    near, required = f
-    needed = required <= MAX_BRAKING - RAPID_BRAKING
-    outcome = torch.where(near <= 0.0, torch.where(needed, NEEDED, NEAR_CRASH), SAFE)
-    return torch.where(near <= CONTACT, TOUCHED, outcome)
+@cache
+def make_problem(drawn: Drawn) -> rare_envs.DrivingProblem:
+    """Return the problem whose f is the outcome."""
+    change, env_id = CHANGES[drawn.change], STRATA[drawn.stratum].env_id
+    if change.cutter:
+        env_id = f"calibration/{'-'.join(change.cutter)}-{'-'.join(map(str, change.cutter.values()))}"
+        SCENARIOS.setdefault(env_id, CutterModel(**change.cutter).scenario())
+    ego: Any = drawn.ego if drawn.ego in EGOS else load_ego(drawn.ego)
+    if change.driver:
+        ego = HumanEgo(replace(HUMAN_EGOS[drawn.ego].model, **change.driver))
+    return rare_envs.DrivingProblem(env_id, ego, OutcomeMeasure(), drawn.site + change.base)
 
 
-OUTCOME = Combined((find_measure("near_crash"), find_measure("required_deceleration")), classify_outcomes)
-"""Outcome of a drive as a measure; here large is dangerous."""
+def find_stratum(base: Any, name: str) -> Any:
+    """Return a stratum of a base distribution; the distribution itself where it has none."""
+    strata = getattr(base, "strata", None) or ()
+    return next((each.base for each in strata if each.name == name), base)
 
 
-def count_outcomes(events: HumanEvents, driver: str, base: str, draws: int, seed: int = 0) -> CalibrationCell:
-    """Drive draws of a base distribution once and count contacts and near-crashes."""
-    problem = rare_envs.DrivingProblem(events.env_id, DRIVERS[driver], OUTCOME, base)
-    rng = np.random.default_rng(seed)
-    counts, flanks = np.zeros(4, dtype=np.int64), 0
-    for size in split_draws(draws):
-        x = problem.base.sample(size, rng)
-        outcome = problem.evaluate(x)
-        counts += np.bincount(outcome.astype(np.int64), minlength=4)
-        hits = x[outcome == TOUCHED]
-        flanks += problem.crash_kinds(hits).count("side") if len(hits) else 0
-    _, near, needed, contacts = (int(each) for each in counts)
-    return CalibrationCell(events.name, driver, base, draws, contacts, near + needed, needed, flanks)
+def run(job: Job) -> Counter[int]:
+    """Return how often each outcome happened; flanks are counted as number -1."""
+    torch.set_num_threads(1)
+    problem = make_problem(job.drawn)
+    number = list(STRATA).index(job.drawn.stratum)  # changes and egos share their draws
+    base = find_stratum(problem.base, job.drawn.stratum)
+    x = base.sample(job.size, np.random.default_rng([job.seed, number, job.part]))
+    outcome = problem.evaluate(x).astype(np.int64)
+    hits = x[outcome == CONTACT]
+    flanks = problem.crash_kinds(hits).count("side") if len(hits) else 0
+    return Counter(outcome.tolist()) + Counter({-1: flanks})
 
 
-def split_draws(draws: int, most: int = 20_000) -> list[int]:
-    """Return sizes of parts that fit into memory."""
-    return [min(most, draws - first) for first in range(0, draws, most)]
+def list_jobs(drawn: Iterable[tuple[Drawn, int]], seed: int) -> Iterator[Job]:
+    """Yield the draws of each cell part by part."""
+    for what, draws in drawn:
+        for part, first in enumerate(range(0, draws, CHUNK)):
+            yield Job(what, part, min(CHUNK, draws - first), seed)
 
 
-def judge(events: HumanEvents, frequency: EventFrequency, cells: Mapping[str, CalibrationCell]) -> list[str]:
-    """Return sentences on what is off: the base distribution, the driver or the definition.
-
-    Args:
-        events: The kind of event.
-        frequency: How often it happens.
-        cells: Of each driver.
-    """
-    human, best = cells["human"], cells["full braking at once"]
-    low, high = human.interval(human.contacts)
-    least, most = count_per_event(events.contacts, frequency)
-    rare = count_per_event(events.near_crashes, frequency)[1]
-    told = [f"People: {least:.1e} to {most:.1e} contacts per {events.name}."]
-    if low <= most and high >= least:
-        return [*told, f"The human driver model agrees: {low:.1e} to {high:.1e}."]
-    times = human.contacts / human.draws / most
-    told.append(f"The human driver model: {low:.1e} to {high:.1e}, {times:.2g} times the upper end of people's.")
-    floor, ceiling = best.interval(best.contacts + best.needed)
-    rarely = f"people have near-crashes in up to {rare:.1e}"
-    if floor > rare:
-        told.append(
-            f"Distribution: off. Whoever brakes fully at once still needs more than 0.5 g, or comes into contact, in "
-            f"{floor:.1e} or more, and {rarely}: as they begin and are scripted, the events are too dangerous for "
-            "any driver."
-        )
-    else:
-        told.append(
-            "Distribution: not shown to be off by itself. Whoever brakes fully at once needs more than 0.5 g, or comes "
-            f"into contact, in {floor:.1e} to {ceiling:.1e}; {rarely}."
-        )
-    if human.flanks:
-        told.append(
-            f"Scenario: {human.flanks / human.contacts:.0%} of the contacts are flank against flank: the script of the "
-            "cutter goes on with its lane change, and brakes for its own lead, whoever is beside it."
-        )
-    for part, driver, against in (
-        ("glances", "human", "human without glances"),
-        ("reaction and noticing", "human without glances", "human without glances, reacting at once"),
-    ):
-        told.append(f"Driver: {part} take contacts from {cells[against].contacts:,} to {cells[driver].contacts:,}.")
-    if human.near_crashes:
-        share, idm = human.needed / human.near_crashes, cells["idm"].near_crashes / cells["idm"].draws
-        told.append(
-            f"Definition: of the near-crashes {share:.0%} needed more than 0.5 g at some moment; the rest is braking "
-            f"that the car-following model chooses and nobody needs (`idm`: {idm:.0%} of draws)."
-        )
-    return told
+def count(drawn: Sequence[tuple[Drawn, int]], seed: int, workers: int) -> Iterator[CalibrationCell]:
+    """Drive all draws, by processes, and yield the cells as they are done."""
+    jobs = list(list_jobs(drawn, seed))
+    with ProcessPoolExecutor(workers, get_context("spawn")) as executor:
+        counted = executor.map(run, jobs) if workers > 1 else map(run, jobs)
+        sums: dict[Drawn, Counter[int]] = {}
+        left = Counter(job.drawn for job in jobs)
+        for job, found in zip(jobs, counted, strict=True):
+            of = sums.setdefault(job.drawn, Counter())
+            of.update(found)
+            left[job.drawn] -= 1
+            if not left[job.drawn]:
+                draws = sum(of[outcome] for outcome in range(5))
+                yield CalibrationCell(*job.drawn, draws, of[RAPID], of[COUNTER], of[EVADED], of[CONTACT], of[-1])
 
 
-def format_measured(cells: Sequence[CalibrationCell], command: str) -> str:
-    """Return the measured part of the page."""
-    lines = [MEASURED, "", f"`{command}`; {cells[0].draws:,} draws each, intervals of 95 %.", ""]
-    for events in EVENTS:
-        own = {cell.driver: cell for cell in cells if cell.event == events.name}
-        base = next(iter(own.values())).base
-        frequency = events.find_frequency(base)
-        lines += [f"### Per {events.name} (`{events.env_id}`, base `{base}`)", ""]
-        lines += ["| driver | contacts | near-crashes | near-crashes that needed 0.5 g |", "|---|---|---|---|"]
-        lines += [format_row(cell) for cell in own.values()]
-        people = [count_per_event(each, frequency) for each in (events.contacts, events.near_crashes)]
+def plan(sites: Sequence[str], draws: int, egos: Sequence[str], changes: bool = True) -> list[tuple[Drawn, int]]:
+    """Return the cells and their numbers of draws, those of `human` first."""
+    found: dict[Drawn, int] = {}
+    for site in sites:
+        here = {name: each for name, each in STRATA.items() if site in find_scenario(each.env_id).bases}
+        for ego in egos:
+            share = EGOS.get(ego, OWN_EGO_SHARE)
+            found |= {Drawn(site, name, ego): round(draws * share * each.share) for name, each in here.items()}
+        first = site == sites[0]
+        for name, change in CHANGES.items() if changes and first else ():
+            of = {Drawn(site, each, HUMAN, name): STRATA[each].share for each in change.strata if name and each in here}
+            found |= {what: round(draws * CHANGED_SHARE * max(share, 0.25)) for what, share in of.items()}
+    return [(what, max(number, 100)) for what, number in found.items()]
+
+
+# --- sums over strata, and people ---------------------------------------------------------------
+
+
+def add(parts: Sequence[tuple[float, ModelCount]]) -> ModelCount:
+    """Return the sum of share x probability; its interval adds up squares of distances (Zou and Donner, 2008)."""
+    p = sum(share * each.p for share, each in parts)
+    below, above = (math.hypot(*(share * (each[end] - each.p) for share, each in parts)) for end in (1, 2))
+    return ModelCount(p, max(p - below, 0.0), p + above)
+
+
+def find_events(site: str) -> dict[Event, tuple[float, dict[str, float]]]:
+    """Return of each kind of event at a site how often it happens per km, and its strata with their shares."""
+    found: dict[Event, tuple[float, dict[str, float]]] = {}
+    for env_id in (CUT_IN, HARD_BRAKE):
+        scenario = find_scenario(env_id)
+        if site not in scenario.bases:
+            continue
+        base: Any = load_base(scenario, site)
+        frequency: EventFrequency = base.frequency
+        for each in base.strata:
+            event = STRATA[each.name].event
+            if env_id == CUT_IN:
+                found.setdefault(event, (frequency.per_km, {}))[1][each.name] = each.share
+            else:  # each stratum is an event of its own
+                found[event] = (frequency.per_km * each.share, {each.name: 1.0})
+    return found
+
+
+def calibrate(cells: Sequence[CalibrationCell], site: str) -> dict[Event, EventCalibration]:
+    """Return contacts and near-crashes of each ego per event, and people's, of the cells without changes."""
+    found: dict[Event, EventCalibration] = {}
+    for event, (per_km, shares) in find_events(site).items():
+        drivers: dict[str, dict[Outcome, ModelCount]] = {}
+        for ego in dict.fromkeys(cell.ego for cell in cells):
+            own = {c.stratum: c for c in cells if (c.site, c.ego, c.change) == (site, ego, "") and c.stratum in shares}
+            if set(own) == set(shares):
+                drivers[ego] = {
+                    "contacts": add([(w, own[name].probability(own[name].contacts)) for name, w in shares.items()]),
+                    "near_crashes": add(
+                        [(w, own[name].probability(own[name].near_crashes)) for name, w in shares.items()]
+                    ),
+                }
+        found[event] = EventCalibration(event=event, base=site, per_km=per_km, drivers=drivers, provisional=False)
+    return found
+
+
+def to_package(found: Mapping[Event, EventCalibration], command: str) -> dict[str, Any]:
+    """Return what `rare_envs.exposure.calibration` reads: the bracket alone."""
+    events = {
+        event: {
+            "base": each.base,
+            "per_km": each.per_km,
+            "drivers": {
+                ego: {outcome: [float(f"{value:.3g}") for value in of] for outcome, of in each.drivers[ego].items()}
+                for ego in (HUMAN, BRACKET)
+            },
+        }
+        for event, each in found.items()
+    }
+    return {"provisional": False, "command": command, "events": events}
+
+
+# --- the page -----------------------------------------------------------------------------------
+
+EVENT_WORDS: Mapping[Event, str] = {"cut_in": "cut-in", "stop": "lead that stops", "slowing": "lead that slows"}
+OUTCOMES: tuple[Outcome, Outcome] = ("contacts", "near_crashes")
+
+
+def show(p: ModelCount, scale: float = 1.0, digits: str = ".1e") -> str:
+    """Return a probability, or a rate by its scale, with its interval."""
+    low, high = scale * p.low, scale * p.high
+    return f"{scale * p.p:{digits}} ({low:{digits}} to {high:{digits}})" if p.p > 0 else f"under {high:{digits}}"
+
+
+def people_count(each: EventCalibration, outcome: Outcome) -> ModelCount:
+    """Return people's probability per event in the same form."""
+    p, (low, high) = each.people(outcome)
+    return ModelCount(p, low, high)
+
+
+def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[str]:
+    """Return the tables of egos and people, per event and per million km."""
+    lines = [f"### {site}", ""]
+    for event, each in found.items():
+        scale = MILLION_KM * each.per_km
         lines += [
-            f"| people, 100-Car | {' | '.join(f'{low:.1e} to {high:.1e}' for low, high in people)} | |",
+            f"Per {EVENT_WORDS[event]}, {each.per_km:.2f} of them per km, and per million km:",
             "",
-            *(f"* {each}" for each in judge(events, frequency, own)),
-            "",
+            "| | contacts | near-crashes | contacts per million km | near-crashes per million km |",
+            "|---|---|---|---|---|",
         ]
-    return "\n".join([*lines, *format_per_km(cells)]) + "\n"
-
-
-def format_row(cell: CalibrationCell) -> str:
-    """Return one driver's row: probabilities per event, with intervals."""
-
-    def share(count: int) -> str:
-        low, high = cell.interval(count)
-        return f"{count / cell.draws:.1e} ({low:.1e} to {high:.1e})" if count else f"under {high:.1e}"
-
-    near = "" if cell.driver == "full braking at once" else share(cell.near_crashes)  # all are, by construction
-    return f"| {cell.driver} | {share(cell.contacts)} | {near} | {share(cell.needed)} |"
-
-
-def format_per_km(cells: Sequence[CalibrationCell]) -> list[str]:
-    """Return the table of the human driver model, per million km."""
-    lines = [
-        "### Per million km",
-        "",
-        "| | events per km | contacts | people | near-crashes | people |",
-        "|---|---|---|---|---|---|",
-    ]
-    for events in EVENTS:
-        cell = next(cell for cell in cells if (cell.event, cell.driver) == (events.name, "human"))
-        per_km = events.find_frequency(cell.base).per_km
-        scale = MILLION_KM * per_km / cell.draws
-        lines.append(
-            f"| {events.name} | {per_km:.2f} "
-            f"| {scale * cell.contacts:,.0f} | {events.contacts.per_million_km:.2g} "
-            f"| {scale * cell.near_crashes:,.0f} | {events.near_crashes.per_million_km:.2g} |"
-        )
+        rows = {**each.drivers, "**people**": {outcome: people_count(each, outcome) for outcome in OUTCOMES}}
+        for ego, of in rows.items():
+            values = [show(of[outcome]) for outcome in OUTCOMES]
+            values += [show(of[outcome], scale, ".2g") for outcome in OUTCOMES]
+            lines.append(f"| {ego} | {' | '.join(values)} |")
+        lines.append("")
     return lines
 
 
-def describe_people(events: HumanEvents, frequency: EventFrequency) -> dict[str, Any]:
-    """Return what the counts are compared with, for JSON."""
-    return {
-        "frequency": {**asdict(frequency), "per_km": frequency.per_km},
-        "contacts": events.contacts.to_dict(),
-        "contacts_per_event": count_per_event(events.contacts, frequency),
-        "near_crashes": events.near_crashes.to_dict(),
-        "near_crashes_per_event": count_per_event(events.near_crashes, frequency),
-    }
+def format_cells(cells: Sequence[CalibrationCell], title: str) -> list[str]:
+    """Return the table of single strata."""
+    names = "change", "draws", "contacts", "flanks", "near-crashes: the ego's", "the cutter's", "rapid, not needed"
+    lines = [title, "", f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    for c in cells:
+        flank = f"{c.flanks / c.contacts:.0%}" if c.contacts else ""
+        counts = [show(c.probability(c.contacts)), flank, show(c.probability(c.counter))]
+        counts += [show(c.probability(c.evaded)) if c.stratum == "unseen" else "", f"{c.rapid / c.draws:.1e}"]
+        what = STRATA[c.stratum].words + ("" if c.change else f", {c.site}, {c.ego}")
+        lines.append(f"| {what} | {c.change} | {c.draws:,} | {' | '.join(counts)} |")
+    return [*lines, ""]
+
+
+def describe_factor(factor: float) -> str:
+    """Return a factor from people's interval in words."""
+    if factor == 1.0:
+        return "inside people's interval"
+    return f"{factor:.2g} times its upper end" if factor > 1.0 else f"{1.0 / factor:.2g} times below its lower end"
+
+
+def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCell], site: str) -> list[str]:
+    """Return a sentence for each target, and on what the strata say by themselves."""
+    told = []
+    for event, each in found.items():
+        within = WITHIN[event]
+        for outcome in OUTCOMES:
+            factor = each.factor(outcome)
+            met = "met" if 1.0 / within <= factor <= within else "MISSED"
+            told.append(
+                f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]}, within a factor of {within:g}: **{met}**, "
+                f"{describe_factor(factor)} (`{BRACKET}`: {describe_factor(each.factor(outcome, BRACKET))})."
+            )
+    of = {c.stratum: c for c in cells if (c.site, c.ego, c.change) == (site, HUMAN, "")}
+    unseen, cut_ins = of.get("unseen"), found.get("cut_in")
+    if unseen is None or cut_ins is None:
+        return told
+    conflicts = unseen.contacts + unseen.near_crashes
+    low, high = clopper_pearson(unseen.contacts, max(conflicts, 1), CONFIDENCE)
+    told.append(
+        f"Contacts among the conflicts with cutters who had not looked: {low:.1%} to {high:.1%}; people none of 44 own "
+        "and none of 58 sideswipe conflicts, under 3.6 %."
+    )
+    km, near = rare_envs.exposure.UNSEEN_CHANGES_100CAR, unseen.near_crashes / unseen.draws
+    share = km.per_million_km / MILLION_KM / cut_ins.per_km / near if near > 0 else math.nan
+    told.append(
+        f"The share of cutters who had not looked that gives people's 44 near-crashes in own changes: {share:.1e} "
+        f"(the scenario has {UNSEEN_SHARE:.1e}): what cutters who had not looked add to near-crashes is calibrated."
+    )
+    shares = find_events(site)["cut_in"][1]
+    scale = people_in("cut_in").near_crashes.miles * rare_envs.exposure.KM_PER_MILE * cut_ins.per_km
+    own = sum(shares[name] * of[name].counter / of[name].draws for name in shares)
+    theirs = sum(shares[name] * of[name].evaded / of[name].draws for name in shares)
+    told.append(
+        f"By type, in the 100-Car's distance: {scale * own:.0f} near-crashes at cut-ins that the ego avoids (people: "
+        f"74 rear-end), {scale * theirs:.0f} that the cutter avoids (people: 58 sideswipe)."
+    )
+    return told
+
+
+def format_measured(cells: Sequence[CalibrationCell], sites: Sequence[str], command: str) -> str:
+    """Return the measured part of the page."""
+    lines = [MEASURED, "", f"`{command}`; intervals of 95 %, of sampling and of people's counts alone.", ""]
+    for site in sites:
+        lines += format_events(calibrate(cells, site), site)
+    first = sites[0]
+    lines += ["### Targets", "", *(f"* {each}" for each in judge(calibrate(cells, first), cells, first)), ""]
+    plain = [c for c in cells if not c.change]
+    lines += format_cells(plain, "### By stratum")
+    lines += format_cells([c for c in cells if c.change], f"### Parts taken away one at a time, `human` on {first}")
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def write_page(measured: str) -> None:
@@ -278,32 +426,34 @@ def write_page(measured: str) -> None:
     PAGE.write_text(text + measured, encoding="utf-8")
 
 
-@use_one_thread()
 def main(
-    base: Annotated[
-        list[str] | None, typer.Option(help="CutIn=NAME or HardBrake=NAME; the default of each scenario otherwise.")
-    ] = None,
-    draws: Annotated[int, typer.Option(help="Draws of each base distribution.")] = 200_000,
+    draws: Annotated[int, typer.Option(help="Draws of `human` where contacts are rarest.")] = 1_000_000,
+    site: Annotated[list[str] | None, typer.Option(help="Site; the first one's changes are driven too.")] = None,
+    ego: Annotated[list[str] | None, typer.Option(help="Another ego beside the shipped ones, such as ppo.zip.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help="These egos alone, from `--ego` too.")] = None,
+    changes: Annotated[bool, typer.Option(help="Whether to take parts away.")] = True,
+    workers: int = 2,
     seed: int = 0,
-    page: Annotated[bool, typer.Option(help="Whether to write the JSON and the page.")] = True,
+    write: Annotated[bool, typer.Option(help="Whether to write both files and the page.")] = True,
 ) -> None:
-    """Measure, say what is off, and write the page."""
-    chosen = dict(each.split("=", 1) for each in base or [])
-    cells, people = [], {}
-    for events in EVENTS:
-        short = events.env_id.removeprefix("rare_envs/").rpartition("-v")[0]
-        name = chosen.get(short, find_scenario(events.env_id).default_base)
-        people[events.name] = describe_people(events, events.find_frequency(name))
-        for driver in DRIVERS:
-            cells.append(count_outcomes(events, driver, name, draws, seed))
-            print(cells[-1], flush=True)
-    command = "python -m benchmarks.driving.human_calibration" + "".join(f" --base {each}" for each in base or [])
-    measured = format_measured(cells, command)
+    """Measure, compare with people, and write."""
+    sites, egos = site or ["us101", "i80"], only or [*EGOS, *(ego or [])]
+    cells = []
+    for cell in count(plan(sites, draws, egos, changes), seed, workers):
+        cells.append(cell)
+        print(cell, flush=True)
+    options = {"draws": [str(draws)], "site": site or [], "ego": ego or [], "only": only or [], "seed": [str(seed)]}
+    given = "".join(f" --{name} {value}" for name, values in options.items() for value in values)
+    command = f"python -m benchmarks.driving.human_calibration{given}"
+    measured = format_measured(cells, sites, command)
     print(measured)
-    if page:
-        about = {"command": command, "seed": seed, "version": rare_envs.__version__, "model": asdict(HUMAN)}
-        content = {**about, "people": people, "cells": [asdict(cell) for cell in cells]}
-        CALIBRATION_RESULT.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    if write:
+        found = calibrate(cells, sites[0])
+        about = {"command": command, "version": rare_envs.__version__, "model": asdict(HUMAN_EGOS[HUMAN].model)}
+        told = {"verdicts": judge(found, cells, sites[0]), "cells": [asdict(cell) for cell in cells]}
+        CALIBRATION_RESULT.write_text(json.dumps({**about, **told}, indent=1) + "\n", encoding="utf-8")
+        package = json.dumps(to_package(found, command), indent=1)
+        CALIBRATION_OF_PACKAGE.write_text(package + "\n", encoding="utf-8")
         write_page(measured)
 
 

@@ -99,8 +99,7 @@ def test_near_crashes_are_those_of_a_second_rollout_with_the_same_noise() -> Non
 
 def test_whoever_has_to_evade_the_ego_makes_a_near_crash() -> None:
     """A scenario that says so where its lead is slower than 12 m/s; the ego keeps away from it by itself."""
-    scenario = replace(find_scenario(FOLLOWING), name="evading")
-    object.__setattr__(scenario, "evades", lambda state: state.speed[:, 1] < 12.0)
+    scenario = replace(find_scenario(FOLLOWING), name="evading", evades=lambda state: state.speed[:, 1] < 12.0)
     world = World(scenario, measurement=Measurement("near_crash"))
     x = torch.tensor([(20.0, 10.0, 100.0), (20.0, 15.0, 100.0), (30.0, 5.0, 5.0)])
     f = rollout(world, IDM(), x).f
