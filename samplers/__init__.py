@@ -14,7 +14,7 @@ from samplers.distributions import as_distribution
 from samplers.estimation import EstimationInterrupted, estimate
 from samplers.evaluate import Executor
 from samplers.executors import FuturesPool, InProcess, LocalProcesses, RayCluster
-from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
+from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps
 from samplers.methods import METHODS, Auto, get_method
 from samplers.methods.base import Method
 from samplers.methods.blocks import BetaBlock, GaussianBlock, MixtureBlock, NormalBlock, Product
@@ -37,6 +37,7 @@ from samplers.problem import (
 from samplers.result import Estimate
 from samplers.run import Progress, Run, RunArguments
 from samplers.sample import Failures, Level, Sample, Status
+from samplers.stratified_problem import StratifiedProblem, Stratum
 from samplers.workers import ExecutorError
 
 __all__ = [
@@ -71,6 +72,7 @@ __all__ = [
     "MonteCarlo",
     "NormalBlock",
     "Outcome",
+    "Part",
     "Pilot",
     "PlannedRun",
     "Problem",
@@ -87,6 +89,8 @@ __all__ = [
     "Status",
     "Stepping",
     "Steps",
+    "StratifiedProblem",
+    "Stratum",
     "SubsetSimulation",
     "Surrogate",
     "TermGradients",

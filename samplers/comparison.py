@@ -11,7 +11,13 @@ from scipy.special import stdtrit
 
 from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, summarise_refits
 from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
-from samplers.analysis.weighted import cov_inflation, has_independent_points, interval_of_sum, require_sample
+from samplers.analysis.weighted import (
+    add_unresolved,
+    cov_inflation,
+    has_independent_points,
+    interval_of_sum,
+    require_sample,
+)
 from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods import Auto
@@ -337,7 +343,9 @@ def _side(totals: FloatArray, factor: float, single: bool, either: Estimate) -> 
     if p == 0:
         return Side(p=0.0, interval=(0.0, either.interval[1]), cov=math.inf, ess=0.0)
     cov = factor * _error(totals) / p
-    return Side(p=p, interval=interval_of_sum(p, cov, ess, single, either.confidence), cov=cov, ess=ess)
+    low, high = interval_of_sum(p, cov, ess, single, either.confidence)
+    high = float(add_unresolved(either, *np.array([[either.gamma], [p], [high]]))[0])
+    return Side(p=p, interval=(low, high), cov=cov, ess=ess)
 
 
 def _ratio_interval(totals: FloatArray, factor: float, single: bool, either: Estimate) -> Interval:

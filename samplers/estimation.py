@@ -22,9 +22,11 @@ from samplers.method import Stepping
 from samplers.methods import Auto, get_method
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import Inputs, OnError, Problem, StandardNormal, check_number
+from samplers.replicate import InputsOnly
 from samplers.result import Estimate
-from samplers.run import InputsOnly, Listener, Progress, Run, RunArguments, check_problem, choose_seed
+from samplers.run import Listener, Progress, Run, RunArguments, check_problem, choose_seed
 from samplers.sample import Status
+from samplers.strata import read_strata
 
 DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 NARROW_TERMINAL = 72
@@ -186,11 +188,10 @@ def _open_journal(path: str | os.PathLike[str] | None, problem: Inputs, seed: in
 def check_base(problem: Problem) -> None:
     """Raise a ValueError if the base distribution's map does not fit its draws: p would be wrong without a warning."""
     check_problem(problem, "dim", "base", "evaluate")
-    if type(problem.base) is StandardNormal:
-        return
-    fault = find_base_fault(problem.base, int(problem.dim))
-    if fault is not None:
-        raise ValueError(f"The parts of problem.base ({type(problem.base).__name__}) do not fit together: {fault}.")
+    for base in (problem.base, *(stratum.base for stratum in read_strata(problem.base))):
+        fault = None if type(base) is StandardNormal else find_base_fault(base, int(problem.dim))
+        if fault is not None:
+            raise ValueError(f"The parts of problem.base ({type(base).__name__}) do not fit together: {fault}.")
 
 
 def find_stop(time_limit: float | None, stop: Callable[[Progress], bool] | None) -> Stop:
@@ -256,6 +257,8 @@ def add_ensemble_run(
     try:
         inputs = InputsOnly(evaluator.dim, pool_refits(base))
     except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
+        return first
+    if read_strata(base) and not read_strata(inputs.base):  # a rare stratum of one density would not be found
         return first
     try:
         Run(inputs, method, further)

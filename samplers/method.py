@@ -1,15 +1,13 @@
-"""Contract of a method (`Stepping`), its goal and outcome, independent outcomes as one, what a whole run has found."""
+"""Contract of a method (`Stepping`), its goal, its outcome and the parts of one, what a whole run has found."""
 
 import math
 import sys
-from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, stdtrit
 
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms
 from samplers.sample import (
@@ -22,6 +20,7 @@ from samplers.sample import (
     SimulationRows,
     Status,
     binomial_cov,
+    bound_missed,
     clopper_pearson,
     normalise_weights,
 )
@@ -91,6 +90,13 @@ class Outcome:
     """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
     draw_weights: tuple[DrawWeights, ...] = field(default=(), compare=False, repr=False)
     """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
+    parts: "tuple[Part, ...]" = ()
+    """The strata of the base distribution, whose p_k with their shares w_k add up to p; empty where it has none."""
+
+    def bound_missed(self, confidence: float) -> float:
+        """Return the largest probability of a region that all base draws miss with probability 1 - confidence."""
+        drawn = [(part.share, part.outcome.base_draws) for part in self.parts] or [(1.0, self.base_draws)]
+        return bound_missed(drawn, confidence)
 
     def remark_first(self, about: str) -> "Outcome":
         """Return the outcome with a remark before its own."""
@@ -112,6 +118,67 @@ class Outcome:
             counts=(hits, n),
             base_draws=n,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """What one stratum of the base distribution adds to p = sum_k w_k p_k.
+
+    Example:
+        >>> import samplers
+        >>> safe, bold = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], 1) for at in (9.0, 1.0))
+        >>> strata = samplers.Stratum("careful", 0.99, safe), samplers.Stratum("bold", 0.01, bold)
+        >>> result = samplers.estimate(samplers.StratifiedProblem(strata), "mc", seed=0, max_sim=10_000)
+        >>> for part in result.parts:  # P = 0.01 Phi(-1) = 0.00159
+        ...     print(part)
+        careful (99 % of x): p below 8.1e-04, no failure in 4,534 simulations
+        bold (1 % of x): p = 1.614e-01 [1.517e-01, 1.714e-01], 100 % of the sum; 5,465 simulations
+    """
+
+    name: str
+    """Of the stratum."""
+    share: float
+    """Probability w_k of the stratum under the base distribution."""
+    outcome: Outcome
+    """Estimate of p_k = P[f(X) <= gamma | stratum]."""
+    n_sim: int = 0
+    """Simulations in this stratum, pilot included."""
+    of_sum: float = math.nan
+    """w_k p_k / p; NaN where p = 0."""
+    method: str = ""
+    """Name of the method that gave p_k."""
+    n_units: int = field(default=0, compare=False, repr=False)
+    """Independent units of its points; in `Estimate.sample` they follow those of the parts before."""
+
+    @property
+    def p(self) -> float:
+        """Estimate of p_k."""
+        return self.outcome.p
+
+    @property
+    def interval(self) -> Interval:
+        """Interval of p_k."""
+        return self.outcome.interval
+
+    @property
+    def cov(self) -> float:
+        """Coefficient of variation of `p`; inf where it is 0."""
+        return self.outcome.cov
+
+    def __str__(self) -> str:
+        """Return one line for people."""
+        low, high = self.interval
+        about = f"{self.name} ({100 * self.share:.4g} % of x): "
+        if self.p == 0:
+            what = f"no failure in {self.n_sim:,} simulations" if self.n_sim else "not simulated"
+            return f"{about}p below {high:.1e}, {what}"
+        ends = f"[{low:.3e}, {high:.3e}]"
+        return f"{about}p = {self.p:.3e} {ends}, {_percent(self.of_sum)} of the sum; {self.n_sim:,} simulations"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        names = ("name", "share", "p", "interval", "cov", "of_sum", "n_sim", "method")
+        return {**{name: getattr(self, name) for name in names}, "status": str(self.outcome.status)}
 
 
 class Interrupted(Exception):
@@ -258,6 +325,12 @@ class Choice(NamedTuple):
     unusual: bool = False
 
 
+def choose_method(method: Stepping, inputs: Inputs, goal: Goal) -> Choice:
+    """Return the method itself, or what it chooses: `Auto`, or one of your own that has `choose(inputs, goal)`."""
+    choose: Callable[[Inputs, Goal], Choice] | None = getattr(method, "choose", None)
+    return Choice(method) if choose is None else choose(inputs, goal)
+
+
 def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:
     """Return the (weighted) share of points without an outcome, f = -inf, among f (k,)."""
     missing = np.isneginf(f)
@@ -268,6 +341,11 @@ def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> fl
 
 MANY_FAILURES = 5
 """Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
+
+
+def _percent(share: float) -> str:
+    """Return a share in words: "92 %", "below 1 %"."""
+    return "below 1 %" if share < 0.01 else f"{100 * share:.0f} %" if share <= 0.99 else f"{100 * share:.4g} %"
 
 
 def _hit_warnings(hits: int, n: int) -> tuple[str, ...]:
@@ -338,159 +416,3 @@ class EstimateData(Outcome):
             inside = (run == weights.run) & (row >= 0) & (row < len(weights.log_weights))
             log_weight[inside] = weights.log_weights[row[inside]] + weights.log_share
         return SimulationRows(run, stage, log_weight)
-
-
-# Independent outcomes as one
-
-OWN_ERROR_FACTOR = 1.5
-"""Factor by which runs may understate their own errors before they are said to disagree."""
-MIN_SPREAD = 1 / 3
-"""Least spread of runs, as a share of their own errors: they are closer together by chance, such as counts that tie."""
-UNINFORMATIVE_COV = 1.0
-"""From this c.o.v. on the p of a run adds nothing to its interval."""
-DISAGREEMENT_LEVEL = 1e-4
-"""Probability that runs whose errors are right are said to disagree."""
-STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
-"""The status of the combined runs is the first of these that one of them has."""
-
-
-def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
-    """Return R independent runs as one: pooled counts, or their mean with a t interval.
-
-    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer run, with the
-    Clopper-Pearson interval: a t interval would ignore that the spread of counts is known. Otherwise p is the mean of
-    p-hat (unbiased; its logarithm is not). Runs that were stopped before their end are left out of the mean if any run
-    came to its end: one that has not reached the failures has p-hat = 0. Their levels stay in the trace.
-    """
-    if len(outcomes) == 1:
-        return outcomes[0]
-    trace = tuple(replace(level, run=i) for i, outcome in enumerate(outcomes) for level in outcome.trace)
-    counts = pool_counts(outcomes)
-    used = outcomes if counts else [each for each in outcomes if each.status is not Status.STOPPED] or outcomes
-    shares = [each.counts[1] / counts[1] if counts and each.counts else 1 / len(used) for each in used]
-    remarks, weights = _collect_texts([each.remarks for each in used]), _share_weights(outcomes, used, shares)
-    if counts:
-        hits, n = counts
-        no_outcome = sum(each.no_outcome_share * each.counts[0] for each in used if each.counts)
-        whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
-        return replace(whole, sample=_merge_samples(used, shares), draw_weights=weights, remarks=remarks)
-    left_out = len(outcomes) - len(used)
-    about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
-    if len(used) == 1:
-        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about), draw_weights=weights)
-    p = np.array([outcome.p for outcome in used])
-    mean = float(p.mean())
-    present = {outcome.status for outcome in used}
-    status = next((each for each in STATUS_PRIORITY if each in present), Status.BUDGET)
-    return Outcome(
-        p=mean,
-        interval=_mean_interval(used, p, confidence),
-        cov=combined_cov(used),
-        status=status if mean > 0 else Status.NO_HITS,
-        warnings=(*_collect_texts([outcome.warnings for outcome in used]), *about, *_warn_of_disagreement(used, p)),
-        remarks=remarks,
-        trace=trace,
-        no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
-        sample=_merge_samples(used, shares),
-        base_draws=sum(outcome.base_draws for outcome in used),
-        draw_weights=weights,
-    )
-
-
-def pool_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
-    """Return failing and all draws of the runs together; None if a run is no share of plain draws."""
-    counts = [outcome.counts for outcome in outcomes if outcome.counts is not None]
-    if len(counts) < len(outcomes):
-        return None
-    return sum(hits for hits, _ in counts), sum(n for _, n in counts)
-
-
-def combined_cov(outcomes: Sequence[Outcome]) -> float:
-    """Return the c.o.v. of the combined runs: of pooled counts or, for a mean, the larger of the own and that seen."""
-    counts = pool_counts(outcomes)
-    if counts is not None:
-        hits, n = counts
-        return binomial_cov(hits / n, n)
-    p = np.array([outcome.p for outcome in outcomes])
-    if not p.any():
-        return math.inf
-    seen = float((p / p.mean()).std(ddof=1)) if len(p) > 1 else 0.0
-    return max(_own_error(outcomes), seen) / math.sqrt(len(p))
-
-
-def _own_error(outcomes: Sequence[Outcome]) -> float:
-    """Return the root mean square of the errors that the runs state, relative to the mean of their p."""
-    mean = float(np.mean([outcome.p for outcome in outcomes]))
-    errors = [outcome.p / mean * outcome.cov for outcome in outcomes if outcome.p > 0]  # p squared might underflow
-    return math.hypot(*errors) / math.sqrt(len(outcomes))
-
-
-def _mean_interval(outcomes: Sequence[Outcome], p: FloatArray, confidence: float) -> Interval:
-    """Return the interval p_bar exp(-+ t s / sqrt(R)) of the mean of p (R,), t with R - 1 degrees of freedom.
-
-    s is the standard deviation of log p-hat (of p-hat / p_bar, where a run has p-hat = 0), but at least a third of the
-    runs' own c.o.v. Where no run has a c.o.v. under 1 their spread is not known either: the interval then covers the
-    intervals of all runs.
-    """
-    mean, runs = float(p.mean()), len(p)
-    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
-        return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
-    spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
-    spread = max(spread, MIN_SPREAD * _own_error(outcomes))
-    half = float(stdtrit(runs - 1, 0.5 + confidence / 2)) * spread / math.sqrt(runs)
-    return mean * math.exp(-half), min(1.0, mean * math.exp(half))
-
-
-def _warn_of_disagreement(outcomes: Sequence[Outcome], p: FloatArray) -> list[str]:
-    """Return a warning if runs with p (R,) lie further apart than their errors allow: some of them missed a region."""
-    error = OWN_ERROR_FACTOR * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
-    if len(p) < 3 or not (error > 0).all():
-        return []
-    with np.errstate(over="ignore"):  # inf is far enough apart
-        apart = float((((p - p.mean()) / error) ** 2).sum())
-    if chdtrc(len(p) - 1, apart) > DISAGREEMENT_LEVEL:
-        return []
-    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
-
-
-def _merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
-    """Return the points behind a mean of R runs with these shares, or None if a run does not give its own."""
-    samples = [outcome.sample for outcome in outcomes if outcome.sample is not None]
-    if len(samples) < len(outcomes):
-        return None
-    first_units = np.cumsum([0, *(sample.n_units for sample in samples)])
-    parts = list(zip(first_units, shares, samples, strict=False))
-    layers = tuple(
-        replace(layer, weights=share * layer.weights, units=first + layer.units)
-        for first, share, sample in parts
-        for layer in sample.all_layers
-    )
-    return Sample(
-        f=np.concatenate([sample.f for sample in samples]),
-        weights=np.concatenate([share * sample.weights for _, share, sample in parts]),
-        units=np.concatenate([first + sample.units for first, _, sample in parts]),
-        n_units=int(first_units[-1]),
-        x=np.concatenate([sample.x for sample in samples]),
-        layers=layers if any(sample.layers for sample in samples) else (),
-        lineages=sum(sample.lineages for sample in samples),
-    )
-
-
-def _share_weights(
-    outcomes: Sequence[Outcome], used: Sequence[Outcome], shares: Sequence[float]
-) -> tuple[DrawWeights, ...]:
-    """Return the weights of single simulations in a mean of the runs used, by share; none where a run gives none."""
-    if not all(outcome.draw_weights for outcome in used):
-        return ()
-    number = {id(outcome): run for run, outcome in enumerate(outcomes)}
-    return tuple(
-        replace(weights, run=number[id(outcome)], log_share=math.log(share))
-        for outcome, share in zip(used, shares, strict=True)
-        for weights in outcome.draw_weights
-    )
-
-
-def _collect_texts(of_runs: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """Return the warnings or remarks of runs, each once, with the number of runs that have it."""
-    texts = Counter(text for run in of_runs for text in run)
-    return tuple(f"In {count} of {len(of_runs)} runs: {text}" for text, count in texts.items())

@@ -17,7 +17,7 @@ from samplers.analysis.gate import Pilot, Verdict, judge_estimate
 from samplers.analysis.reweight import Reweighted, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import Share, require_sample, split_by_kind
-from samplers.method import EstimateData, Stepping
+from samplers.method import EstimateData, Outcome, Part, Stepping
 from samplers.output import (
     Kept,
     StoredMethod,
@@ -39,7 +39,6 @@ from samplers.sample import (
     SimulatedPoints,
     Status,
     describe_outcome,
-    zero_hit_bound,
 )
 
 if TYPE_CHECKING:
@@ -71,9 +70,10 @@ class Estimate(EstimateData, Kept):
 
         M = 1 - (1 - confidence)^(1 / n) for n base draws, the one-sided Clopper-Pearson bound without a hit: n draws
         all miss a larger region with probability under 1 - confidence. M = 1 without base draws. Levels of f, wide
-        draws and chains may find far smaller regions, but guarantee nothing.
+        draws and chains may find far smaller regions, but guarantee nothing. Of a sum over strata, a region may lie in
+        several of them.
         """
-        return zero_hit_bound(self.base_draws, self.confidence)
+        return self.bound_missed(self.confidence)
 
     def curve(self, gammas: ArrayLike) -> Curve:
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
@@ -270,6 +270,7 @@ class Estimate(EstimateData, Kept):
         lines = [
             f"P[f <= {self.gamma:g}] = {self.p:.3e}",
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
+            *(f"  {part}" for part in self.parts),
             *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{describe_outcome(self.status, self.warnings)}; {self.failures.total:,} failing points",
@@ -360,6 +361,7 @@ class Estimate(EstimateData, Kept):
         data = {name: getattr(self, name) for name in plain.split()} | {
             "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),
             "final_draws": None if self.sample is None else self.sample.n_units,
+            "parts": [part.to_dict() for part in self.parts],
             "status": str(self.status),
             "trace": [asdict(level) for level in self.trace],
             "failures": {"total": points.total}
@@ -406,5 +408,5 @@ def without_base(estimate: _EstimateT) -> _EstimateT:
     )
 
 
-register_stored(StoredEstimate, Estimate, BaseUncertainty, Failures, Level, Status, StoredMethod)
+register_stored(StoredEstimate, Estimate, Outcome, Part, BaseUncertainty, Failures, Level, Status, StoredMethod)
 register_stored(Sample, Layer, DrawWeights, SimulatedPoints)

@@ -6,27 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.reweight import check_refits
-from samplers.method import (
-    Answer,
-    Choice,
-    Goal,
-    Interrupted,
-    Outcome,
-    Request,
-    Stepping,
-    Steps,
-    TermsOffer,
-    combine,
-    combined_cov,
-    pool_counts,
-    whole_simulations,
-)
+from samplers.combination import combine
+from samplers.method import Answer, Choice, Goal, Outcome, Request, Stepping, TermsOffer, choose_method
 from samplers.problem import (
     ON_ERROR,
     Distribution,
@@ -35,7 +21,6 @@ from samplers.problem import (
     Inputs,
     OnError,
     TermGradients,
-    Terms,
     check_name,
     check_number,
     check_whole,
@@ -43,29 +28,15 @@ from samplers.problem import (
     names_of_columns,
     one_per_row,
 )
+from samplers.replicate import InputsOnly, Replicate, count_simulations, meets_target, needs_another, outcomes_of
 from samplers.result import Estimate
-from samplers.sample import Failures, SimulatedPoints, Status, gain_over_monte_carlo
+from samplers.sample import Failures, Interval, SimulatedPoints, Status, gain_over_monte_carlo
+from samplers.strata import SumOfStrata, read_strata
 
 MOST_SIMULATIONS = 10**12
 """Largest `max_sim`: more is a slip of the keyboard."""
-MIN_REPLICATES = 5
-"""Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
-MAX_REPLICATES = 200
-"""Runs made at most for target_cov: if they miss it, each run is too small."""
-NO_OUTCOME = -np.inf
-"""f as methods see it for a row without an outcome (counted as failing, on_error not "raise")."""
-SMALLEST_F = float(np.finfo(np.float64).min)
-"""f as methods see it where f is -inf, so that NO_OUTCOME keeps its meaning."""
 KEEP_FAILURES = 1000
 """Failing points kept: enough for every listing, little memory in hundreds of dimensions."""
-NOT_KNOWN = Outcome(
-    p=0.0,
-    interval=(0.0, 1.0),
-    cov=math.inf,
-    status=Status.STOPPED,
-    warnings=("The run was stopped before its method could say anything: p = 0 stands for not known.",),
-)
-"""Outcome of a run that was stopped before its first values of f, or whose method does not handle `Interrupted`."""
 
 
 @dataclass(frozen=True)
@@ -153,15 +124,6 @@ class Progress:
 Listener = Callable[[Progress], None]
 
 
-@dataclass(frozen=True)
-class InputsOnly:
-    """dim, base and offer of a problem: all that a method is shown, so that it cannot call f itself."""
-
-    dim: int
-    base: Distribution
-    offer: TermsOffer | None = None
-
-
 def check_problem(problem: Inputs, *needed: str) -> None:
     """Raise a ValueError unless a problem has the attributes needed, a dimension and a base whose refits fit it."""
     for name in needed:
@@ -243,9 +205,10 @@ class Run:
         self._on_error, n = arguments.on_error, self._n_wanted
         most = self._goal.max_sim
         shares = [None if most is None else most * (i + 1) // n - most * i // n for i in range(n)]
-        choose = getattr(method, "choose", None)  # of `Auto`, or of a method of one's own; by the smallest share
-        goal = replace(self._goal, max_sim=shares[0])
-        self._choice: Choice = Choice(method) if choose is None else choose(self._inputs, goal)
+        strata = read_strata(problem.base)
+        goal = replace(self._goal, max_sim=shares[0])  # the smallest share
+        self._choice = Choice(method) if strata else choose_method(method, self._inputs, goal)
+        self._method = SumOfStrata(method, strata) if strata else self._choice.method
         self.progress, self._listener = Progress(n_sim=0, max_sim=self._goal.max_sim), listener
         self._n_sim = self._n_errors = 0
         self._failures = Failures.empty(self._inputs.dim)
@@ -389,10 +352,14 @@ class Run:
         self._merge_failures()
         goal, outcomes = self._goal, [replicate.outcome for replicate in self._replicates if replicate.outcome]
         whole, met = combine(outcomes, goal.confidence), meets_target(outcomes, goal.target_cov, self._n_wanted)
-        low, high = whole.interval
         status, warnings, remarks = whole.status, [*whole.warnings], [*whole.remarks]
-        if self._on_error == "bound":
-            low *= 1 - whole.no_outcome_share
+        parts = tuple(  # their points are in those of the sum
+            replace(
+                part,
+                outcome=replace(part.outcome, interval=self._find_ends(part.outcome), sample=None, draw_weights=()),
+            )
+            for part in whole.parts
+        )
         if self._n_errors:
             where = " (not in the lower end of the interval)" if self._on_error == "bound" else ""
             warnings.append(f"{self._n_errors} simulations gave no outcome and were counted as failing{where}.")
@@ -403,9 +370,9 @@ class Run:
             status = Status.BUDGET if status is Status.CONVERGED else status
             remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
         number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
-        found = {"interval": (low, high), "status": status, "warnings": tuple(warnings), "remarks": tuple(remarks)}
+        found = {"status": status, "warnings": tuple(warnings), "remarks": tuple(remarks), "parts": parts}
         return Estimate(
-            **{**vars(whole), **found},
+            **{**vars(whole), **found, "interval": self._find_ends(whole)},
             confidence=goal.confidence,
             gamma=goal.gamma,
             n_sim=self._n_sim,
@@ -423,6 +390,11 @@ class Run:
             points=None if self._points is None else SimulatedPoints.join(self._points, self._inputs.dim),
         )
 
+    def _find_ends(self, outcome: Outcome) -> Interval:
+        """Return the interval; points without an outcome that only bound p are not in its lower end."""
+        low, high = outcome.interval
+        return low * (1 - outcome.no_outcome_share) if self._on_error == "bound" else low, high
+
     def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""
         number, target = len(self._replicates), self._goal.target_cov
@@ -433,131 +405,10 @@ class Run:
             on_level=lambda level: self._update(level=level.gamma, p=level.estimate, run=number),
         )
         rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(number,)))
-        self._replicates.append(Replicate(self._choice.method.steps(self._inputs, goal, rng), goal, self._inputs))
+        self._replicates.append(Replicate(self._method.steps(self._inputs, goal, rng), goal, self._inputs))
 
     def _start_more_for_target(self) -> None:
         """Start one more run where all are done, the target is missed and the budget allows it."""
-        while self.done and needs_another(self._replicates, self._choice.method, self._goal, self._n_wanted):
+        while self.done and needs_another(self._replicates, self._method, self._goal, self._n_wanted):
             max_sim = self._goal.max_sim
             self._start_replicate(None if max_sim is None else max_sim - self._n_sim)
-
-
-def meets_target(outcomes: Sequence[Outcome], target_cov: float | None, replicates: int) -> bool:
-    """Return whether these runs together meet target_cov (as they do where there is none).
-
-    With more of them than `replicates`, at least MIN_REPLICATES are made unless their counts pool.
-    """
-    if target_cov is None:
-        return True
-    few = replicates < len(outcomes) < MIN_REPLICATES and pool_counts(outcomes) is None
-    return not few and combined_cov(outcomes) <= target_cov
-
-
-def needs_another(runs: Sequence[Replicate], method: Stepping, goal: Goal, replicates: int) -> bool:
-    """Return whether finished runs miss the target and one more may be made.
-
-    It may not where as many runs as `replicates` have come to the limit of their method, 200 are
-    made, or too little of max_sim is left: less than the longest run took, except for runs that
-    pool, which can be cut short (beside longer ones, a short run would spoil a mean).
-    """
-    outcomes = [run.outcome for run in runs if run.outcome is not None]
-    if meets_target(outcomes, goal.target_cov, replicates) or len(runs) >= MAX_REPLICATES:
-        return False
-    targets = [run.goal.target_cov for run in runs]
-    missed = [t is not None and outcome.cov > t for t, outcome in zip(targets, outcomes, strict=True)]
-    if method.stops_at_target and sum(missed) >= replicates:
-        return False
-    left = goal.budget - sum(run.n_sim for run in runs)
-    return left >= (1 if pool_counts(outcomes) is not None else max(run.n_sim for run in runs))
-
-
-class Replicate:
-    """The steps of one run of a method: the points it requests next and, at the end, its outcome.
-
-    Attributes:
-        goal: The goal it was given; more than goal.max_sim points are refused.
-        requested: What the method waits for; no points once it has its outcome.
-        n_sim: Simulations made for it so far.
-        outcome: Its outcome; None while it runs.
-    """
-
-    def __init__(self, steps: Steps, goal: Goal, inputs: InputsOnly) -> None:
-        self.goal, self._inputs, self._steps = goal, inputs, steps
-        self.n_sim = 0
-        self.outcome: Outcome | None = None
-        self.requested = Request("f", (np.empty((0, inputs.dim)),))
-        self._advance(lambda: next(steps))
-
-    def tell(self, answer: Answer) -> None:
-        """Give the method what it requested, without NaN, and let it run to its next request or its end.
-
-        Points without an outcome fail, in every term too.
-        """
-        self.n_sim += count_simulations(answer)
-        f, seen = outcomes_of(answer), answer
-        if f is not None:
-            shown = np.where(np.isnan(f), NO_OUTCOME, np.maximum(f, SMALLEST_F))
-            seen = shown
-            if isinstance(answer, Terms):
-                values = np.where(np.isneginf(shown)[:, None], -np.inf, answer.values)
-                seen = replace(answer, f=shown, values=values)
-        self._advance(lambda: self._steps.send(cast(FloatArray, seen)))  # see `samplers.method.request_terms`
-
-    def interrupt(self) -> None:
-        """End the run: its outcome is what the method concludes from the values of f so far."""
-        self.outcome = NOT_KNOWN
-        if self.n_sim:
-            try:
-                self._steps.throw(Interrupted())
-            except StopIteration as end:
-                self.outcome = _check_outcome(end.value)
-            except Interrupted:
-                pass
-        self._steps.close()
-
-    def _advance(self, resume: Callable[[], FloatArray | Request]) -> None:
-        """Resume the method until it requests at least one point or returns its outcome."""
-        try:
-            self.requested = self._check_request(resume())
-            while len(self.requested) == 0:
-                self.requested = self._check_request(self._steps.send(np.empty(0)))
-        except StopIteration as end:
-            self.outcome = _check_outcome(end.value)
-
-    def _check_request(self, given: FloatArray | Request) -> Request:
-        """Return a request, or points as one; raise unless it is offered, of a right shape and within the budget."""
-        request = given if isinstance(given, Request) else Request("f", (np.asarray(given, dtype=np.float64),))
-        offer, n = self._inputs.offer, len(request.x) if request.x.ndim else 0
-        no_gradients = request.kind == "gradient" and (offer is None or offer.gradient_cost is None)
-        if request.kind != "f" and (offer is None or n == 0 or no_gradients):
-            raise RuntimeError(f"The method asked for {request.kind} that the run cannot give.")
-        if request.x.ndim != 2 or request.x.shape[1] != self._inputs.dim:
-            raise ValueError(f"Expected x of shape (n, {self._inputs.dim}), got {request.x.shape}.")
-        if request.kind == "gradient" and offer is not None:
-            n = offer.count_gradients(n)
-        if self.n_sim + n > self.goal.budget:
-            raise RuntimeError(
-                f"The method asked for {n} simulations with {self.goal.budget - self.n_sim} of "
-                f"max_sim={self.goal.max_sim} left; a method must keep to goal.max_sim."
-            )
-        return request
-
-
-def outcomes_of(answer: Answer) -> FloatArray | None:
-    """Return the outcomes f (n,) of an answer; None for gradients, which have none."""
-    if isinstance(answer, TermGradients):
-        return None
-    return answer.f if isinstance(answer, Terms) else answer
-
-
-def count_simulations(answer: Answer) -> int:
-    """Return the simulations behind an answer: its rows or, for gradients, what they cost, as a whole number."""
-    f = outcomes_of(answer)
-    return whole_simulations(cast(TermGradients, answer).cost) if f is None else len(f)
-
-
-def _check_outcome(value: object) -> Outcome:
-    """Return the value; raise a TypeError unless it is an Outcome."""
-    if not isinstance(value, Outcome):
-        raise TypeError(f"Expected the steps of the method to return an Outcome, got {value!r}.")
-    return value

@@ -92,6 +92,8 @@ class Level:
     """Effective number of points behind `p` (chains) or of failing points (weights)."""
     run: int = 0
     """Number of the replicate that the level belongs to."""
+    stratum: str = ""
+    """Stratum that it belongs to, whose own probability `estimate` is; empty where the base has none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -324,6 +326,25 @@ def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
 def zero_hit_bound(n: int, confidence: float) -> float:
     """Return the one-sided Clopper-Pearson bound of a probability of which n draws showed nothing; 1 for n = 0."""
     return -math.expm1(math.log1p(-confidence) / n) if n else 1.0
+
+
+def bound_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> float:
+    """Return the largest probability of a region that all draws miss with probability 1 - confidence.
+
+    `drawn` has the share w_k of each stratum and the n_k draws made in it. A region with the part m_k of a stratum is
+    missed with probability prod_k (1 - m_k)^n_k; sum_k w_k m_k is largest where w_k (1 - m_k) / n_k is the same for all
+    strata that it reaches into, and those without a draw belong to it whole.
+    """
+    if len(drawn) == 1:
+        return zero_hit_bound(drawn[0][1], confidence)
+    w, n = (np.array(column, dtype=np.float64) for column in zip(*drawn, strict=True))
+    whole, order = float(w[n == 0].sum()), np.argsort(-w / np.maximum(n, 1.0))
+    w, n = (column[order][n[order] > 0] for column in (w, n))
+    logs = np.log(w / n)
+    levels = (np.cumsum(n * logs) + math.log1p(-confidence)) / np.cumsum(n)
+    reached = logs > levels
+    missed = -np.expm1(levels[reached][-1:] - logs[reached])
+    return min(1.0, whole + float((w[reached] * missed).sum()))
 
 
 def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:

@@ -19,8 +19,9 @@ from samplers.estimation import estimate
 from samplers.limit_states import half_space, normal_cdf, two_modes
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray, FunctionProblem
+from samplers.replicate import NOT_KNOWN
 from samplers.result import Estimate
-from samplers.run import NOT_KNOWN, Run, RunArguments
+from samplers.run import Run, RunArguments
 from samplers.sample import Status
 
 

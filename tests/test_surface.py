@@ -217,6 +217,16 @@ def test_estimate_takes_its_arguments_and_fills_an_estimate() -> None:
     assert worst.x.shape[1] == 2 and np.all(worst.f <= 0) and np.all(np.diff(worst.log_p0) <= 0)
 
 
+def test_a_sum_of_strata_is_estimated_with_its_parts() -> None:
+    looked, unseen = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 1.0))
+    strata = samplers.Stratum("looked", 0.99, looked), samplers.Stratum("unseen", 0.01, unseen, log_sd=0.5)
+    result = samplers.estimate(samplers.StratifiedProblem(strata), "mc", seed=0, max_sim=20_000)
+    assert [part.name for part in result.parts] == ["looked", "unseen"] and result.base_uncertainty is not None
+    assert (
+        isinstance(result.parts[0], samplers.Part) and result.parts[1].interval[0] < 0.159 < result.parts[1].interval[1]
+    )
+
+
 def test_samplers_need_no_torch() -> None:
     code = "import sys, samplers; sys.exit('torch' in sys.modules or 'gymnasium' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

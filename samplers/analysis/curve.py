@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.weighted import (
     MIN_UNITS,
+    add_unresolved,
     cov_inflation,
     no_outcome_weight,
     require_sample,
@@ -132,7 +133,8 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     of plain draws, else log-normal with the t quantile of the effective units. At that level normal
     deviations with the correlation of the curve stay inside all intervals with probability
     `confidence` (sup-t); it is found from 10,000 draws, whose generator comes from the seed.
-    Where p rests on a search, the upper ends hold the share that it may have missed, as that of the estimate does.
+    Where p rests on a search, the upper ends hold the share that it may have missed, as that of the estimate does, and
+    what strata may add of which no point lies below the threshold.
     The truth rises with g, so the ends of the band are made to rise too, which only narrows it.
 
     The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma
@@ -151,6 +153,7 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     high[use] = [
         add_unseen(*ends, sample.lineages, estimate.confidence) for ends in zip(p[use], high[use], strict=True)
     ]
+    high[use] = add_unresolved(estimate, grid[use], p[use], high[use])
     high[use] = np.minimum.accumulate(high[use][::-1])[::-1]
     here = place[:-1]
     return Curve(

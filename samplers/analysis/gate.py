@@ -32,7 +32,7 @@ from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.weighted import Reported
 from samplers.method import EstimateData
 from samplers.problem import check_number
-from samplers.sample import Status, zero_hit_bound
+from samplers.sample import Status
 
 Decision = Literal["passes", "fails", "undecided"]
 
@@ -98,7 +98,7 @@ def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty |
         raise ValueError(f"Expected max_p above 0 and below 1, got {max_p!r}.")
     confidence = round(0.5 + estimate.confidence / 2, 12)
     none_failed = estimate.status is Status.NO_HITS
-    own = (0.0, zero_hit_bound(estimate.base_draws, confidence)) if none_failed else estimate.interval
+    own = (0.0, estimate.bound_missed(confidence)) if none_failed else estimate.interval
     (low, high), reason = own, ""
     if base is not None:
         low, high = base.interval or (0.0, 1.0 if base.bound is None else base.bound)

@@ -26,6 +26,7 @@ from scipy.special import stdtrit
 from samplers.analysis.weighted import (
     MIN_UNITS,
     Reported,
+    add_unresolved,
     cov_inflation,
     has_independent_points,
     interval_of_sum,
@@ -140,7 +141,8 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     variance is sum T_c^2 - p1^2 / n, to which the largest T_c^2 is added: where one term dominates, the
     sample variance is too small most of the time. The interval is log-normal with the t
     quantile of the effective units. Where p rests on a search, the upper end holds the share that it may have missed,
-    as that of the estimate does; its lineages count for less as the effective units become fewer.
+    as that of the estimate does; its lineages count for less as the effective units become fewer. A stratum without a
+    failing point keeps its upper end, with its share in the new base where that has one of the same name.
     """
     sample = require_sample(estimate)
     if isinstance(new_base, str):
@@ -172,6 +174,8 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     p = min(1.0, estimate.p * ratio)
     low, high = interval_of_sum(p, cov, units, has_independent_points(sample), estimate.confidence)
     high = add_unseen(p, high, sample.lineages * min(1.0, units / old_units), estimate.confidence)
+    at = np.array([estimate.gamma])
+    high = float(add_unresolved(estimate, at, np.array([p]), np.array([high]), new_base)[0])
     if estimate.on_error == "bound":
         low *= 1 - float(terms[np.isneginf(f)].sum()) / total
     return Reweighted(

@@ -71,6 +71,26 @@ def no_outcome_weight(estimate: EstimateData, sample: Sample) -> float:
     return float(sample.weights[np.isneginf(sample.f)].sum()) if estimate.on_error == "bound" else 0.0
 
 
+def add_unresolved(
+    estimate: EstimateData, thresholds: FloatArray, p: FloatArray, high: FloatArray, new_base: Any = None
+) -> FloatArray:
+    """Return upper ends (G,) of p (G,) at thresholds g (G,) with what strata may add of which no point has f <= g.
+
+    That is the root of the sum of (w_k h_k)^2, h_k the upper end of their p_k, as in the interval of the sum. A new
+    base with strata of the same names has its own w_k.
+    """
+    if not estimate.parts:
+        return high
+    layers, squares, first = require_sample(estimate).all_layers, np.zeros(len(thresholds)), 0
+    new_shares = {stratum.name: stratum.share for stratum in getattr(new_base, "strata", None) or ()}
+    for part in estimate.parts:
+        end = first + part.n_units
+        least = min(each.f[(each.units >= first) & (each.units < end)].min(initial=math.inf) for each in layers)
+        squares += (least > thresholds) * (new_shares.get(part.name, part.share) * part.interval[1]) ** 2
+        first = end
+    return np.asarray(np.where(squares > 0, np.minimum(p + np.hypot(high - p, np.sqrt(squares)), 1.0), high))
+
+
 @dataclass(frozen=True, eq=False)
 class UnitSums:
     """Sums over units at G thresholds."""

@@ -6,7 +6,7 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.method import Goal, TermsOffer
-from samplers.run import InputsOnly
+from samplers.replicate import InputsOnly
 
 
 def choice(dim=2, seconds=None, **goal):

@@ -1,0 +1,239 @@
+"""Sums over strata: p = sum_k w_k p_k, the simulations where the error of the sum is.
+
+Every stratum has runs of its own under its own base distribution. First come pilots, a quarter of the simulations in
+equal parts. The rest goes to the strata half by Neyman's rule, in proportion to w_k times the standard deviation of
+p_k for one simulation, and half in proportion to w_k times the width of its interval, which a stratum without a failure
+has too. One whose part of the rest is no larger than its pilot keeps the pilot; any other has a new run, and p_k is
+that of the new run alone, so that the pilot decides how large the run is and adds nothing to it: unbiased. Counts of
+plain draws are pooled with those of the pilot, which makes p too low by less than a tenth of its standard error
+(`benchmarks/samplers/strata.py`).
+
+With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in strata whose own c.o.v. is above
+t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t.
+
+References:
+    Neyman, "On the two different aspects of the representative method", Journal of the Royal Statistical Society 97,
+    1934.
+    Etore and Jourdain, "Adaptive optimal allocation in stratified sampling methods", Methodology and Computing in
+    Applied Probability 12, 2010.
+"""
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.combination import combine, dilute, pool_counts, sum_strata
+from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, choose_method, offer_of
+from samplers.problem import Distribution, FloatArray, Inputs
+from samplers.replicate import NOT_KNOWN, InputsOnly, Replicate, needs_another
+from samplers.sample import Level, Status
+
+PILOT_SHARE = 0.25
+"""Share of max_sim for the pilots."""
+FEWEST = 20
+"""Simulations for each stratum up to which there are no pilots: all are made at once, in equal parts."""
+PILOT_COV = 0.3
+"""C.o.v. at which pilots stop where there is a target; a larger target takes its place."""
+MARGIN = 0.9
+"""Part of a target c.o.v. that a stratum is given: the sum's own p is not yet known."""
+MOST_ROUNDS = 6
+"""Rounds of runs for a target, pilots aside."""
+SHARE_ROUNDING = 1e-6
+"""Shares add up to 1 within this."""
+
+
+class BaseStratum(Protocol):
+    """A stratum of a base distribution, one of its `strata`: the base is the mixture of theirs by share."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def share(self) -> float:
+        """Its probability w_k; those of all strata add up to 1."""
+
+    @property
+    def base(self) -> Distribution:
+        """Distribution of X in it, over the same columns; supports of strata do not overlap."""
+
+
+def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
+    """Raise a ValueError unless strata have different names and shares above 0 that add up to 1."""
+    if len(set(names)) < len(names) or not all(isinstance(name, str) and name for name in names):
+        raise ValueError(f"Expected strata with different names, got {', '.join(map(repr, names))}.")
+    if not all(share > 0 for share in shares) or abs(math.fsum(shares) - 1) > SHARE_ROUNDING:
+        given = " + ".join(f"{share:.6g}" for share in shares)
+        raise ValueError(f"Expected shares of strata above 0 that add up to 1, got {given} = {math.fsum(shares):.6g}.")
+
+
+def read_strata(base: Any) -> tuple[BaseStratum, ...]:
+    """Return the strata of a base distribution, none where it has fewer than two; a ValueError if they do not fit."""
+    strata = tuple(getattr(base, "strata", None) or ())  # a base distribution need not have it
+    check_shares([stratum.name for stratum in strata], [stratum.share for stratum in strata] or [1.0])
+    for stratum in strata:
+        if not isinstance(stratum.base, Distribution):
+            raise ValueError(f"Expected a base distribution of stratum {stratum.name!r}, got {stratum.base!r}.")
+    return strata if len(strata) > 1 else ()
+
+
+@dataclass(frozen=True)
+class SumOfStrata:
+    """A method for one density as one for sums over strata."""
+
+    method: Stepping
+    strata: tuple[BaseStratum, ...]
+
+    name: ClassVar[str] = "strata"
+    stops_at_target: ClassVar[bool] = True
+
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
+        """Make pilots, then runs where the error is."""
+        return _Sum(self, inputs, goal, rng).steps()
+
+
+class Task(NamedTuple):
+    """A run to be made in a stratum."""
+
+    stratum: int
+    max_sim: int | None
+    target_cov: float | None
+
+
+class _Sum:
+    """The state of a run of `SumOfStrata`."""
+
+    def __init__(self, method: SumOfStrata, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> None:
+        self.method, self.strata, self.inputs, self.goal, self.rng = method.method, method.strata, inputs, goal, rng
+        nothing = replace(
+            NOT_KNOWN,
+            status=Status.BUDGET,
+            warnings=("It was not simulated, for lack of simulations: p = 0 stands for not known.",),
+        )
+        self.parts = [Part(name=one.name, share=float(one.share), outcome=nothing) for one in self.strata]
+        self.behind = np.zeros(len(self.strata))
+        """Simulations of the runs behind the outcomes."""
+        self.trace = list[Level]()
+        self.n_sim, self.stopped, self.at_limit = 0, False, set[int]()
+
+    @property
+    def left(self) -> int:
+        """Simulations left."""
+        return self.goal.budget - self.n_sim
+
+    def steps(self) -> Steps:
+        """Make rounds of runs until there is nothing to add."""
+        tasks, rounds = self._plan_pilots(), 0
+        while tasks:
+            for task in tasks:
+                if not self.stopped:
+                    yield from self._run(task)
+            rounds += 1
+            more = not self.stopped and rounds <= (1 if self.goal.target_cov is None else MOST_ROUNDS)
+            tasks = self._plan_more() if more else []
+        return sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
+
+    def _plan_pilots(self) -> list[Task]:
+        """Return a first run for every stratum, or for the largest ones where there are fewer simulations."""
+        k, n, target = len(self.parts), self.goal.max_sim, self.goal.target_cov
+        target = max(target, PILOT_COV) if target is not None and self.method.stops_at_target else None
+        if n is None:
+            return [Task(i, None, target) for i in range(k)]
+        few = n < FEWEST * k
+        sizes = np.full(k, n // k if few else int(PILOT_SHARE * n) // k)
+        if few:
+            sizes[np.argsort([-part.share for part in self.parts], kind="stable")[: n % k]] += 1
+        return [Task(i, int(size), target) for i, size in enumerate(sizes) if size]
+
+    def _plan_more(self) -> list[Task]:
+        """Return the runs to make beside those made."""
+        target, whole = self.goal.target_cov, sum_strata(self.parts, self.goal.confidence, ())
+        if target is None or whole.p == 0:
+            if self.goal.max_sim is None or self.left < 1:
+                return []
+            return [Task(i, int(n), target) for i, n in enumerate(self._allocate(np.full(len(self.parts), True))) if n]
+        if whole.cov <= target:
+            return []
+        limits = [target / math.sqrt(part.of_sum) if part.p > 0 else math.inf for part in whole.parts]
+        missed = [part.cov > limit for part, limit in zip(whole.parts, limits, strict=True)]
+        wanted = np.array([late and i not in self.at_limit for i, late in enumerate(missed)])
+        if self.goal.max_sim is None:
+            return [Task(int(i), None, MARGIN * limits[i]) for i in np.flatnonzero(wanted)]
+        sizes = self._allocate(wanted)
+        return [Task(i, int(n), MARGIN * limits[i]) for i, n in enumerate(sizes) if n]
+
+    def _allocate(self, use: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return how many of the simulations left each stratum gets, (k,), of those in use."""
+        root = np.array([part.share for part in self.parts]) * np.sqrt(np.maximum(self.behind, 1.0)) * use
+        deviation = root * [part.p * part.cov if part.p > 0 else 0.0 for part in self.parts]
+        width = root * [part.interval[1] - part.interval[0] for part in self.parts]
+        found = deviation if deviation.any() else width
+        need = found / max(found.sum(), 1e-300) + width / max(width.sum(), 1e-300)
+        pools = np.array([part.outcome.counts is not None for part in self.parts])
+        least = np.where(pools, 0.0, self.behind)  # a new run takes the place of the one before: a smaller one is worse
+        while use.any():
+            sizes = np.floor(self.left * need * use / (need * use).sum())
+            gain = np.where(use, sizes - least, math.inf)
+            if gain.min() > 0:
+                return np.asarray(sizes, dtype=np.int64)
+            use = use & (np.arange(len(use)) != np.argmin(gain))
+        return np.zeros(len(self.parts), dtype=np.int64)
+
+    def _run(self, task: Task) -> Generator[FloatArray, FloatArray, None]:
+        """Make a run in a stratum; where its method does not stop at a target, as many as that takes."""
+        stratum, part, n_before = self.strata[task.stratum], self.parts[task.stratum], self.n_sim
+        inputs = InputsOnly(self.inputs.dim, stratum.base, offer_of(self.inputs))
+        others = sum(each.share * each.p for each in self.parts if each is not part)
+
+        def tell_level(level: Level) -> None:
+            estimate = others + part.share * level.estimate
+            self.goal.on_level(replace(level, stratum=stratum.name, estimate=estimate))
+
+        goal = replace(self.goal, max_sim=task.max_sim, target_cov=task.target_cov, on_level=tell_level)
+        method, runs, outcomes = choose_method(self.method, inputs, goal).method, list[Replicate](), list[Outcome]()
+        while not self.stopped and (not runs or needs_another(runs, method, goal, 1)):
+            first = self.n_sim
+            left = None if task.max_sim is None else task.max_sim - (first - n_before)
+            own = replace(goal, max_sim=left)
+            run = Replicate(method.steps(inputs, own, self.rng.spawn(1)[0]), own, inputs)
+            runs.append(run)
+            while run.outcome is None:
+                try:
+                    answer = yield run.requested  # type: ignore[misc]  # a Request; see `Steps`
+                except Interrupted:
+                    self.stopped = True
+                    run.interrupt()
+                else:
+                    run.resume(answer)
+            self.n_sim += run.n_sim
+            self.trace += [replace(level, stratum=stratum.name) for level in run.outcome.trace]
+            weights = tuple(replace(each, first=first + each.first) for each in run.outcome.draw_weights)
+            outcomes.append(replace(run.outcome, trace=(), draw_weights=weights))
+        found, n = combine(outcomes, goal.confidence), self.n_sim - n_before
+        if task.max_sim is None and task.target_cov is not None and found.cov > task.target_cov:
+            self.at_limit.add(task.stratum)
+        whole, self.behind[task.stratum] = self._join(part, self.behind[task.stratum], found, n)
+        whole = replace(whole, draw_weights=tuple(replace(each, run=0) for each in whole.draw_weights))
+        self.parts[task.stratum] = replace(part, outcome=whole, n_sim=part.n_sim + n, method=method.name)
+
+    def _join(self, part: Part, n_old: float, found: Outcome, n: float) -> tuple[Outcome, float]:
+        """Return the outcome of a stratum after a further run, and the simulations behind it."""
+        old = part.outcome
+        if n_old == 0:
+            return found, n
+        if pool_counts([old, found]) is not None:
+            return replace(combine([old, found], self.goal.confidence), trace=()), n_old + n
+        drawn = old.base_draws + found.base_draws
+        if found.status is Status.STOPPED:
+            return replace(old, base_draws=drawn), n_old
+        if found.interval[1] < old.interval[0]:
+            about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
+            ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
+            return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
+        if found.p == 0 < old.p:  # what the old run met is not to be lost
+            return dilute(old, found, n_old / (n_old + n)), n_old + n
+        return replace(found, base_draws=drawn), n

@@ -1,0 +1,460 @@
+"""Sums over strata, p = sum_k w_k p_k, against exact answers."""
+
+import json
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.stats import norm
+
+import samplers
+from samplers import FunctionProblem, StratifiedProblem, Stratum
+from samplers.combination import sum_strata
+from samplers.method import Outcome, Part
+from samplers.problem import StandardNormal
+from samplers.proposals import Gaussian
+from samplers.sample import Status, bound_missed
+from samplers.strata import read_strata
+from samplers.testing import check_base
+
+
+def half_space(at, dim=2):
+    """P[f <= 0] = Phi(-at)."""
+    return FunctionProblem(lambda x: at - x.sum(axis=1) / dim**0.5, dim)
+
+
+SHARES, AT = {"looked": 0.98986, "hurried": 0.01, "unseen": 1.4e-4}, {"looked": 4.0, "hurried": 3.0, "unseen": 1.0}
+P = sum(SHARES[name] * norm.sf(AT[name]) for name in SHARES)  # 6.7e-5: 47, 20 and 33 %
+
+
+def roads(shares=SHARES, **log_sd):
+    """Three strata of very different size, of 2, 3 and 1 dimensions."""
+    dims = {"looked": 2, "hurried": 3, "unseen": 1}
+    return StratifiedProblem(
+        [Stratum(name, shares[name], half_space(AT[name], dims[name]), log_sd.get(name)) for name in shares]
+    )
+
+
+def even(shares=(0.7, 0.3), at=(1.5, 1.0)):
+    """Two strata that plain draws resolve."""
+    names = "abcdef"
+    return StratifiedProblem([Stratum(names[k], shares[k], half_space(at[k])) for k in range(len(shares))])
+
+
+def exact(shares, at, above=0.0):
+    """P[f <= above]."""
+    return sum(share * norm.sf(a - above) for share, a in zip(shares, at, strict=True))
+
+
+@dataclass(frozen=True)
+class SplitNormal:
+    """N(0, I) in two dimensions, but x1 lies below `limit` with another probability: two strata, "low" and "high"."""
+
+    limit: float
+    share: float
+    side: str = ""
+    dim: int = 2
+
+    @property
+    def strata(self):
+        shares = (("low", self.share), ("high", 1 - self.share))
+        return tuple(Side(name, share, SplitNormal(self.limit, float(name == "low"), name)) for name, share in shares)
+
+    def from_standard_normal(self, u):
+        q, own = norm.cdf(u[:, 0]), norm.cdf(self.limit)
+        low = q < self.share
+        below = q / self.share * own if self.share else q
+        above = (1 - q) / (1 - self.share) * (1 - own) if self.share < 1 else q
+        return np.column_stack([np.where(low, norm.ppf(np.where(low, below, 0.5)), norm.isf(above)), u[:, 1]])
+
+    def to_standard_normal(self, x):
+        own = norm.cdf(self.limit)
+        q = np.where(x[:, 0] < self.limit, norm.cdf(x[:, 0]) / own * self.share, 0.5)
+        up = norm.sf(x[:, 0]) / (1 - own) * (1 - self.share)
+        return np.column_stack([np.where(x[:, 0] < self.limit, norm.ppf(q), norm.isf(up)), x[:, 1]])
+
+    def sample(self, n, rng):
+        return self.from_standard_normal(rng.standard_normal((n, 2)))
+
+    def log_prob(self, x):
+        own, low = norm.cdf(self.limit), x[:, 0] < self.limit
+        with np.errstate(divide="ignore"):
+            factor = np.where(low, np.log(self.share) - np.log(own), np.log(1 - self.share) - np.log(1 - own))
+        return norm.logpdf(x).sum(axis=1) + factor
+
+
+@dataclass(frozen=True)
+class Side:
+    name: str
+    share: float
+    base: SplitNormal
+
+
+# ---- the sum
+
+
+@pytest.mark.parametrize(
+    ("method", "max_sim"),
+    [
+        *(("mc", 200_000), ("two-stage", 6000), ("adss", 12_000), ("ce", 9000), ("auto", None)),
+        pytest.param("auto", 6000, marks=pytest.mark.slow),
+    ],
+)
+def test_the_sum_is_exact(method, max_sim):
+    result = samplers.estimate(roads(), method, seed=3, max_sim=max_sim, confidence=0.999)
+    assert result.interval[0] < P < result.interval[1]
+    assert abs(result.p - P) < 4 * result.cov * result.p
+    assert result.p == pytest.approx(sum(part.share * part.p for part in result.parts))
+    assert result.n_sim == sum(part.n_sim for part in result.parts) == sum(level.n_sim for level in result.trace)
+    assert sum(part.of_sum for part in result.parts) == pytest.approx(1)
+    if max_sim:
+        assert result.n_sim <= max_sim
+    for part in result.parts:
+        assert part.interval[0] < norm.sf(AT[part.name]) < part.interval[1]
+
+
+def test_the_surrogate_adds_up():
+    result = samplers.estimate(even(at=(3.0, 2.0)), "surrogate", seed=1, max_sim=300)
+    assert result.interval[0] < exact((0.7, 0.3), (3.0, 2.0)) < result.interval[1] and result.n_sim <= 300
+    assert result.cov < 0.2
+
+
+def test_the_ends_are_those_of_zou_and_donner():
+    def part(name, share, p, low, high):
+        return Part(
+            name=name, share=share, outcome=Outcome(p=p, interval=(low, high), cov=0.1, status=Status.CONVERGED)
+        )
+
+    parts = part("a", 0.9, 1e-3, 4e-4, 2e-3), part("b", 0.1, 0.2, 0.15, 0.3)
+    whole = sum_strata(parts, 0.95, ())
+    assert whole.p == pytest.approx(0.0209)
+    assert whole.interval[0] == pytest.approx(0.0209 - math.hypot(0.9 * 6e-4, 0.1 * 0.05))
+    assert whole.interval[1] == pytest.approx(0.0209 + math.hypot(0.9 * 1e-3, 0.1 * 0.1))
+    assert whole.cov == pytest.approx(math.hypot(0.9 * 1e-4, 0.1 * 0.02) / 0.0209)
+    nothing = Outcome(p=0.0, interval=(0.0, 4e-3), cov=math.inf, status=Status.NO_HITS)
+    with_none = sum_strata((Part(name="a", share=0.9, outcome=nothing), parts[1]), 0.95, ())
+    assert with_none.interval == pytest.approx((0.015, 0.02 + math.hypot(0.9 * 4e-3, 0.01)))
+
+
+def test_unbiased_and_covered_with_few_simulations():
+    """100 plain draws for two strata: intervals of shares of draws hold p 95 times in 100 or more."""
+    shares, at = (0.7, 0.3), (2.0, 0.5)
+    p, results = exact(shares, at), [samplers.estimate(even(shares, at), "mc", seed=s, max_sim=100) for s in range(300)]
+    found = np.array([result.p for result in results])
+    assert abs(found.mean() - p) < 3.3 * found.std() / 300**0.5 + 0.1 * found.std()  # pooled pilots
+    assert sum(r.interval[0] <= p <= r.interval[1] for r in results) >= 275  # 95 %, by chance lower in 1 of 700
+    assert found.std() < 0.95 * math.sqrt(p * (1 - p) / 100)  # worth more than 100 draws of the whole
+
+
+def test_simulations_go_where_the_error_of_the_sum_is():
+    result = samplers.estimate(even((0.5, 0.5), (2.5, 0.0)), "mc", seed=0, max_sim=8000)
+    small, large = result.parts  # standard deviations of 0.079 and 0.5
+    assert small.n_sim >= 1000  # its pilot
+    assert large.n_sim / result.n_sim == pytest.approx(0.5 / 0.579, abs=0.08)
+
+
+def test_one_stratum_is_the_plain_estimate():
+    base = SplitNormal(0.0, 0.5)
+    whole = [Side("all", 1.0, StandardNormal(2))]
+    alone = type("Alone", (StandardNormal,), {"strata": whole})(2)
+    for method in ("mc", "two-stage"):
+        problems = FunctionProblem(half_space(2.5).f, base=alone), half_space(2.5)
+        one, plain = (samplers.estimate(problem, method, seed=1, max_sim=2000) for problem in problems)
+        assert one == plain and one.parts == ()
+    assert len(read_strata(base)) == 2 and read_strata(alone) == ()
+
+
+def test_a_base_with_strata_serves_a_function():
+    """x1 < -3 in 1.35e-3 of all draws by itself, in a tenth of them here; failure: x2 > 3, or 1 where x1 is low."""
+    problem = FunctionProblem(lambda x: np.where(x[:, 0] < -3.0, 1.0, 3.0) - x[:, 1], base=SplitNormal(-3.0, 0.1))
+    check_base(problem.base, 2)
+    result = samplers.estimate(problem, seed=0, max_sim=6000)
+    truth = 0.1 * norm.sf(1) + 0.9 * norm.sf(3)
+    assert result.interval[0] < truth < result.interval[1] and result.cov < 0.1
+    assert [part.name for part in result.parts] == ["low", "high"]
+    rare = result.reweight(SplitNormal(-3.0, 0.001))
+    assert rare.interval[0] < 0.001 * norm.sf(1) + 0.999 * norm.sf(3) < rare.interval[1]
+
+
+# ---- how a run goes
+
+
+def test_the_same_seed_is_the_same_answer_with_any_workers():
+    problem = roads()
+    here = samplers.estimate(problem, seed=5, max_sim=3000)
+    with ThreadPoolExecutor(3) as pool:
+        there = samplers.estimate(problem, seed=5, max_sim=3000, executor=pool)
+    assert here == there and here.parts == there.parts
+    assert here != samplers.estimate(problem, seed=6, max_sim=3000)
+
+
+@pytest.mark.parametrize("method", ["mc", "two-stage", "adss", "ce"])
+def test_an_interruption_anywhere_leaves_a_valid_estimate(method):
+    problem = roads()
+    whole = samplers.estimate(problem, method, seed=2, max_sim=4000)
+    for after in np.linspace(1, whole.n_sim - 1, 9).astype(int):
+        result = samplers.estimate(problem, method, seed=2, max_sim=4000, stop=lambda at, n=after: at.n_sim >= n)
+        assert result.n_sim == sum(level.n_sim for level in result.trace)
+        if result.n_sim < whole.n_sim:
+            assert result.status is Status.STOPPED and result.interval[0] <= P <= result.interval[1]
+
+
+def test_a_journal_continues_to_the_same_bits(tmp_path):
+    problem, arguments = roads(), {"seed": 4, "max_sim": 3000, "journal": tmp_path / "journal"}
+    cut = samplers.estimate(problem, **arguments, stop=lambda at: at.n_sim > 1500)
+    assert cut.status is Status.STOPPED
+    again = samplers.estimate(problem, **arguments)
+    assert again == samplers.estimate(problem, seed=4, max_sim=3000)
+
+
+def test_asked_and_told_it_is_the_same():
+    problem = even()
+    run = samplers.TwoStage().start(problem, seed=0, max_sim=3000)
+    while not run.done:
+        run.tell(problem.evaluate(run.ask()))
+    assert run.result() == samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
+
+
+def test_a_stratum_without_a_failure_raises_the_upper_end_alone():
+    result = samplers.estimate(even((0.9, 0.1), (40.0, 1.0)), "mc", seed=0, max_sim=4000)
+    none, some = result.parts
+    assert none.p == 0 and none.interval == pytest.approx((0, 1 - 0.025 ** (1 / none.n_sim)))
+    assert result.interval[0] == pytest.approx(0.1 * some.interval[0])
+    above = math.hypot(0.9 * none.interval[1], 0.1 * (some.interval[1] - some.p))
+    assert result.interval[1] == pytest.approx(result.p + above)
+    assert result.status is Status.CONVERGED and result.warnings == ()
+    assert f"a (90 % of x): p below {none.interval[1]:.1e}, no failure in {none.n_sim:,} simulations" in str(result)
+    assert any("a may add up to" in text for text in result.remarks)
+    assert result.curve([0.0]).high[0] == pytest.approx(result.interval[1], rel=0.05)
+    same = result.reweight(even((0.9, 0.1), (40.0, 1.0)).base)
+    assert same.interval[1] == pytest.approx(result.interval[1], rel=0.05)
+    doubled = result.reweight(even((0.45, 0.55), (40.0, 1.0)).base)
+    assert doubled.p == pytest.approx(5.5 * result.p) and doubled.interval[1] < 5.5 * same.interval[1]
+    assert not result.meets(0.01) and result.meets(0.1)
+
+
+def test_nothing_fails_anywhere():
+    result = samplers.estimate(even((0.9, 0.1), (40.0, 40.0)), "two-stage", seed=0, max_sim=3000)
+    assert result.p == 0 and result.status is Status.NO_HITS and 0 < result.interval[1] < 0.1
+    assert result.warnings and math.isnan(result.parts[0].of_sum)
+
+
+@pytest.mark.parametrize(("method", "max_sim"), [("mc", 10**6), ("two-stage", None), ("adss", None)])
+def test_the_target_is_met_and_nothing_spent_on_what_does_not_matter(method, max_sim):
+    problem, truth = even((0.5, 0.5), (4.0, 1.0)), exact((0.5, 0.5), (4.0, 1.0))  # 2e-4 and 0.9998 of the sum
+    for seed in (0, 1):
+        result = samplers.estimate(problem, method, seed=seed, max_sim=max_sim, target_cov=0.02)
+        assert result.cov <= 0.02 and result.status is Status.CONVERGED
+        assert abs(result.p - truth) < 4 * 0.02 * truth
+        if method == "adss":
+            assert result.parts[0].n_sim < 5000  # one run
+
+
+def test_a_target_that_cannot_be_met_is_told():
+    result = samplers.estimate(even(), "mc", seed=0, max_sim=300, target_cov=0.001)
+    assert result.status is Status.BUDGET and any("was not met" in text for text in result.remarks)
+    assert result.n_sim == 300
+
+
+@pytest.mark.parametrize("max_sim", [1, 2, 3, 4, 11, 50, 61, 100])
+@pytest.mark.parametrize("method", ["mc", "two-stage", "ce", "adss", "auto"])
+def test_tiny_budgets(method, max_sim):
+    result = samplers.estimate(roads(), method, seed=0, max_sim=max_sim)
+    assert result.n_sim <= max_sim and result.interval[0] <= P <= result.interval[1]
+    assert (result.status is Status.NO_HITS) == (result.p == 0)
+    if max_sim < 3:
+        assert "not simulated" in str(result) and result.parts[0].n_sim == 1  # the largest first
+
+
+def test_replicates_of_counts_are_pooled_by_stratum():
+    problem = even()
+    result = samplers.estimate(problem, "mc", seed=0, max_sim=20_000, replicates=4)
+    for part in result.parts:
+        hits, n = part.outcome.counts
+        assert part.p == hits / n and n == part.n_sim
+    assert result.interval[0] < exact((0.7, 0.3), (1.5, 1.0)) < result.interval[1]
+    assert result.interval[1] / result.interval[0] < 1.2  # a t interval of 4 runs would be twice as wide
+
+
+def test_levels_and_warnings_name_their_stratum():
+    result = samplers.estimate(roads(), "adss", seed=1, max_sim=3000)
+    assert {level.stratum for level in result.trace} == set(SHARES)
+    assert all(text.split(":")[0] in SHARES for text in result.warnings)
+    seen = []
+    samplers.estimate(even(), "mc", seed=0, max_sim=40_000, progress=seen.append)
+    assert seen[-1].p == pytest.approx(exact((0.7, 0.3), (1.5, 1.0)), rel=0.05)
+
+
+def test_points_are_kept_with_weights_that_add_up():
+    problem = even()
+    for method in ("mc", "two-stage"):
+        result = samplers.estimate(problem, method, seed=0, max_sim=3000, keep_points=True, replicates=2)
+        table = result.to_arrow().to_pydict()
+        weights = [w for w, failed in zip(table["weight"], table["failed"], strict=True) if failed and w is not None]
+        assert sum(weights) == pytest.approx(result.p, rel=3 * result.cov)
+        if method == "mc":
+            assert sum(weights) == pytest.approx(result.p)
+        stages = [(run, stage) for run, stage in zip(table["run"], table["stage"], strict=True)]
+        strata = [[level.stratum for level in result.trace if level.run == run] for run in (0, 1)]
+        assert all("ab"[int(x)] == strata[run][stage] for x, (run, stage) in zip(table["stratum"], stages, strict=True))
+
+
+def test_rows_without_an_outcome():
+    def f(x):
+        return np.where(x[:, 1] > 2.0, np.nan, 1.0 - x[:, 0])
+
+    parts = [Stratum("a", 0.6, FunctionProblem(f, 2)), Stratum("b", 0.4, half_space(1.5))]
+    q = norm.sf(2.0)
+    high, low = 0.6 * (q + (1 - q) * norm.sf(1)) + 0.4 * norm.sf(1.5), 0.6 * (1 - q) * norm.sf(1) + 0.4 * norm.sf(1.5)
+    problem = StratifiedProblem(parts)
+    counted = samplers.estimate(problem, "mc", seed=0, max_sim=40_000, on_error="failure", confidence=0.99)
+    assert counted.interval[0] < high < counted.interval[1] and counted.interval[0] > low
+    bounded = samplers.estimate(problem, "mc", seed=0, max_sim=40_000, on_error="bound", confidence=0.99)
+    assert bounded.interval[0] < low and bounded.interval[1] == counted.interval[1]
+    with pytest.raises(samplers.EvaluationError, match="f is NaN"):
+        samplers.estimate(problem, "mc", seed=0, max_sim=1000)
+
+
+# ---- what follows from the points
+
+
+def test_other_shares_by_reweighting():
+    result = samplers.estimate(even(), "two-stage", seed=1, max_sim=4000)
+    for shares in ((0.2, 0.8), (0.95, 0.05)):
+        other = result.reweight(even(shares).base)
+        assert other.interval[0] < exact(shares, (1.5, 1.0)) < other.interval[1]
+        assert other.p == pytest.approx(sum(w * part.p for w, part in zip(shares, result.parts, strict=True)), rel=0.02)
+
+
+@pytest.mark.parametrize("method", ["mc", "two-stage", "adss"])
+def test_the_curve_of_a_sum(method):
+    result = samplers.estimate(even(), method, seed=1, max_sim=8000)
+    gammas = [0.0, 0.5, 1.0, 2.0]
+    curve, truth = result.curve(gammas), [exact((0.7, 0.3), (1.5, 1.0), g) for g in gammas]
+    assert (curve.low <= truth).all() and (truth <= curve.high).all()
+
+
+def test_the_error_of_a_share_by_hand():
+    """p = w_1 p_1 + w_2 p_2 with log w_2 of standard deviation 0.4: almost all of p, so log p has about as much."""
+    problem = StratifiedProblem(
+        [Stratum("a", 0.999, half_space(6.0)), Stratum("b", 0.001, half_space(1.0), log_sd=0.4)]
+    )
+    result = samplers.estimate(problem, "two-stage", seed=0, max_sim=6000)
+    found = result.base_uncertainty
+    assert found.spread == pytest.approx(0.4, rel=0.01) and len(found.value_refits) == 100
+    half = 1.984 * math.sqrt(0.4**2 + result.cov**2 + 0.2**2)  # t of 99 degrees of freedom; 0.2: bias of a fit
+    low, high = (result.p * math.exp(sign * half) for sign in (-1, 1))
+    assert found.interval == pytest.approx((low, high), rel=0.02)
+    assert found.fitted_to == "share of b" and found.expected == pytest.approx(result.p * math.exp(0.08), rel=0.05)
+    assert samplers.estimate(even(), "mc", seed=0, max_sim=100).base_uncertainty is None
+
+
+def test_refits_have_shares_that_add_up():
+    base = roads(unseen=0.5, hurried=0.3).base
+    shares = np.array([refit.shares for refit in base.refits])
+    assert shares.sum(axis=1) == pytest.approx(np.ones(100)) and (shares > 0).all()
+    assert np.log(shares).std(axis=0, ddof=1)[1:] == pytest.approx([0.3, 0.5], rel=1e-6)
+    x = base.sample(50, np.random.default_rng(0))
+    assert np.exp(base.refits[3].log_prob(x) - base.log_prob(x)) == pytest.approx(
+        shares[3][x[:, 0].astype(int)] / np.array(base.shares)[x[:, 0].astype(int)]
+    )
+    result = samplers.estimate(roads(unseen=0.5, hurried=0.3), "two-stage", seed=0, max_sim=6000)
+    by_hand = shares @ [part.p for part in result.parts]
+    assert result.base_uncertainty.value_refits == pytest.approx(by_hand, rel=0.05)
+
+
+def test_refits_of_a_base_of_a_stratum_are_those_of_the_sum():
+    class FittedNormal(StandardNormal):
+        refits = tuple(Gaussian(np.array([m, 0.0]), np.eye(2)) for m in (-0.2, 0.0, 0.2))
+        clusters, fitted_to, family = 17, "40 events", "normal"
+
+    fitted = FunctionProblem(lambda x: 2.0 - x[:, 0], base=FittedNormal(2), dim=2)
+    result = samplers.estimate(
+        StratifiedProblem([Stratum("a", 0.5, fitted), Stratum("b", 0.5, half_space(2.0))]), "mc", seed=0, max_sim=40_000
+    )
+    exact_refits = [0.5 * norm.sf(2 - m) + 0.5 * norm.sf(2) for m in (-0.2, 0.0, 0.2)]
+    assert result.base_uncertainty.value_refits == pytest.approx(exact_refits, rel=0.15)
+    assert result.base_uncertainty.clusters == 3  # no more than refits
+
+
+def test_two_sums_are_compared():
+    a, b = even((0.7, 0.3), (2.0, 1.5)), even((0.7, 0.3), (2.2, 1.5))
+    comparison = samplers.compare(a, b, seed=0, max_sim=12_000)
+    truth = exact((0.7, 0.3), (2.0, 1.5)) / exact((0.7, 0.3), (2.2, 1.5))
+    assert comparison.interval[0] < truth < comparison.interval[1]
+    assert comparison.interval[1] / comparison.interval[0] < 1.3
+    for side, p in ((comparison.a, exact((0.7, 0.3), (2.0, 1.5))), (comparison.b, exact((0.7, 0.3), (2.2, 1.5)))):
+        assert side.interval[0] < p < side.interval[1]
+
+
+def test_kinds_of_failure_and_failing_points():
+    result = samplers.estimate(even(), "two-stage", seed=0, max_sim=4000)
+    shares = result.shares(lambda x: np.array(["a", "b"])[x[:, 0].astype(int)].tolist())
+    for part in result.parts:
+        assert shares[part.name].of_failures == pytest.approx(part.of_sum, rel=0.02)
+        assert shares[part.name].interval[0] < part.share * part.p < shares[part.name].interval[1]
+    failures = result.failures
+    assert (np.diff(failures.log_p0) <= 0).all()
+    assert failures.log_p0 == pytest.approx(even().base.log_prob(failures.x))
+    assert result.sensitivity(parameters=False)
+
+
+def test_the_largest_region_that_may_have_been_missed():
+    """Lagrange: of w_1 m_1 + w_2 m_2 under (1 - m_1)^n_1 (1 - m_2)^n_2 = 0.05, by a grid."""
+    for w, n in (((0.7, 0.3), (300, 50)), ((0.99, 0.01), (50, 3000)), ((0.5, 0.5), (10, 10))):
+        m = 1 - 0.05 ** (np.linspace(0, 1, 20_001) / n[0])
+        other = 1 - (0.05 / (1 - m) ** n[0]) ** (1 / n[1])
+        largest = (w[0] * m + w[1] * other).max()
+        assert bound_missed([(w[0], n[0]), (w[1], n[1])], 0.95) == pytest.approx(largest, rel=1e-6)
+    assert bound_missed([(0.9, 0), (0.1, 10)], 0.95) == pytest.approx(0.9 + 0.1 * (1 - 0.05**0.1))
+    equal = brentq(lambda m: (1 - m) ** 100 - 0.05, 0, 1)
+    assert bound_missed([(0.4, 40), (0.6, 60)], 0.95) == pytest.approx(equal)
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    problem = roads(unseen=0.5)
+    result = samplers.estimate(problem, seed=0, max_sim=3000)
+    result.save(tmp_path / "result")
+    loaded = samplers.Estimate.load(tmp_path / "result")
+    assert loaded == result and loaded.parts == result.parts and str(loaded) == str(result)
+    assert loaded.unseen == result.unseen
+    data = json.loads(result.to_json())
+    assert [part["name"] for part in data["parts"]] == list(SHARES)
+    assert data["parts"][2]["p"] == result.parts[2].p and data["parts"][2]["of_sum"] == result.parts[2].of_sum
+
+
+# ---- the problem
+
+
+def test_the_base_fits_together():
+    problem = roads()
+    check_base(problem.base, problem.dim)
+    for stratum in problem.base.strata:
+        check_base(stratum.base, problem.dim)
+    u = np.random.default_rng(0).standard_normal((1000, 4))
+    u[:12, 0] = [-38, -9, -7, -4, 0, 2.5, 3.6, 3.7, 4, 6, 9, 38]
+    x = problem.base.from_standard_normal(u)
+    assert x[:12, 0].astype(int).tolist() == [0, 0, 0, 0, 0, 1, 1, 2, 2, 2, 2, 2]
+    assert problem.base.to_standard_normal(x)[1:10] == pytest.approx(u[1:10], abs=1e-6)
+    assert problem.column_names == ("stratum", "x1", "x2", "x3") and problem.chunk_size == 16
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: StratifiedProblem([]), "at least one"),
+        (lambda: StratifiedProblem([half_space(1.0)]), "Stratum"),
+        (lambda: even((0.7, 0.2)), "add up to 1, got 0.7 .* 0.2 = 0.9"),
+        (lambda: StratifiedProblem([Stratum("a", 0.5, half_space(1.0))] * 2), "different names"),
+        (lambda: Stratum("a", 0.0, half_space(1.0)), "share of 'a'"),
+        (lambda: Stratum("a", 0.5, lambda x: x), "problem with dim"),
+        (lambda: Stratum("a", 0.5, half_space(1.0), log_sd=-1.0), "log_sd of 'a'"),
+        (lambda: read_strata(type("Base", (), {"strata": [Side("a", 1.0, None)]})), "base distribution of stratum 'a'"),
+    ],
+)
+def test_errors_say_what_is_wrong(make, text):
+    with pytest.raises(ValueError, match=text):
+        make()
