@@ -1,7 +1,8 @@
 """Distributions of scenario parameters, with exact maps to standard normal space, and the spaces they live on."""
 
+from rare_envs.distributions.acceptance import AcceptedGaps
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
+from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates, Difference
 from rare_envs.distributions.fitted import (
     EventCounts,
     EventFrequency,
@@ -12,11 +13,15 @@ from rare_envs.distributions.fitted import (
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 from rare_envs.distributions.space import Distribution, DistributionParameter, Parameter, ScenarioSpace
+from rare_envs.distributions.stratified import CutNormals, StratifiedDistribution, Stratum
 
 __all__ = [
+    "AcceptedGaps",
     "BetaDistribution",
     "ClosingSpeed",
     "Coordinates",
+    "CutNormals",
+    "Difference",
     "Distribution",
     "DistributionParameter",
     "EventCounts",
@@ -27,6 +32,8 @@ __all__ = [
     "PredictiveCheck",
     "ProductDistribution",
     "ScenarioSpace",
+    "StratifiedDistribution",
+    "Stratum",
     "TruncatedGaussianMixture",
     "join_independent",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +39,22 @@ CoordinateKind: TypeAlias = Literal["plain", "log"] | ClosingSpeed
 """Kind of the coordinate of a column of x: x itself, log x, or a closing speed."""
 
 
+class Difference(NamedTuple):
+    """A range of the difference of two columns, which cuts the range of the later one in the order.
+
+    Example:
+        >>> Difference("speed", "loss", 1.0, 45.0).least  # a lead that brakes keeps 1 m/s or more
+        1.0
+    """
+
+    column: str
+    """The later one, plain or in logarithms."""
+    earlier: str
+    least: float
+    most: float
+    """column - earlier is from least to most."""
+
+
 @dataclass(frozen=True, eq=False)
 class Coordinates:
     """Coordinates y of points x in a box: one for each column of x, computed in an order of their own.
@@ -52,6 +68,7 @@ class Coordinates:
         kinds: Kind of the coordinate of each column of x, d of them; plain ones by default.
         names: Names of the columns of x; needed where a coordinate or the order names one.
         order: Names of the columns in the order of the coordinates; the order of x by default.
+        within: Ranges of differences of two columns, see `Difference`; none by default.
 
     Raises:
         ValueError: The box is empty, a kind is unknown or names no column, a column in a logarithm or under a root is
@@ -74,6 +91,7 @@ class Coordinates:
     kinds: tuple[CoordinateKind, ...] = ()
     names: tuple[str, ...] = ()
     order: tuple[str, ...] = ()
+    within: tuple[Difference, ...] = ()
 
     def __post_init__(self) -> None:
         freeze_arrays(self, "low", "high")
@@ -86,6 +104,8 @@ class Coordinates:
         self._check_columns()
         for j, kind in enumerate(self.kinds):
             self._check_kind(self.names[j] if self.names else f"column {j}", j, kind)
+        object.__setattr__(self, "within", tuple(Difference(*each) for each in self.within))
+        self._check_differences()
 
     @property
     def dim(self) -> int:
@@ -116,10 +136,22 @@ class Coordinates:
     def bounds(self, j: int, x: FloatArray) -> tuple[Any, Any]:
         """Return the ends, numbers or (n,), of the coordinate of column j in rows x whose earlier columns are set."""
         ends = self.low[j], self.high[j]
+        for each in self.within:
+            if self.names[j] == each.column:
+                other = np.ascontiguousarray(x[:, self.names.index(each.earlier)])
+                ends = np.maximum(ends[0], other + each.least), np.minimum(ends[1], other + each.most)
         if self.rises(j):
             return (np.log(ends[0]), np.log(ends[1])) if self.is_log(j) else ends
         shift, slope = self.line(j, x)
         return (ends[1] - shift) / slope, (ends[0] - shift) / slope
+
+    def contains(self, x: FloatArray) -> NDArray[np.bool_]:
+        """Return which columns of points are in their ranges, (n, d) -> (n, d)."""
+        inside = (x >= self.low) & (x <= self.high)
+        for each in self.within:
+            j, other = self.names.index(each.column), x[:, self.names.index(each.earlier)]
+            inside[:, j] &= (x[:, j] >= other + each.least) & (x[:, j] <= other + each.most)
+        return inside
 
     def coordinate(self, j: int, x: FloatArray) -> FloatArray:
         """Return the coordinate of column j of rows x in the box, (n, d) -> (n,), up to rounding in its bounds."""
@@ -161,8 +193,9 @@ class Coordinates:
             {"closing_behind": kind.behind, "gap": kind.gap} if isinstance(kind, ClosingSpeed) else kind
             for kind in self.kinds
         ]
-        other = {"names": list(self.names), "order": list(self.order)}
-        found = {key: value for key, value in other.items() if value}
+        within = [list(each) for each in self.within]
+        other: dict[str, list[Any]] = {"names": list(self.names), "order": list(self.order), "within": within}
+        found: dict[str, Any] = {key: value for key, value in other.items() if value}
         if found or kinds != ["plain"] * self.dim:
             found = {"coordinates": kinds, **found}
         return {"low": self.low.tolist(), "high": self.high.tolist(), **found}
@@ -188,8 +221,9 @@ class Coordinates:
             for kind in kinds
         )
         # A scenario may give one name to several columns; names matter only where something refers to a column.
-        named = order or any(isinstance(kind, ClosingSpeed) for kind in read)
-        return cls(low, high, read, data.get("names") or () if named else (), order)
+        within = data.get("within") or ()
+        named = order or within or any(isinstance(kind, ClosingSpeed) for kind in read)
+        return cls(low, high, read, data.get("names") or () if named else (), order, within)
 
     def _check_columns(self) -> None:
         """Raise a ValueError unless box, names and order fit d columns."""
@@ -207,6 +241,16 @@ class Coordinates:
                 f"order must have each of the columns {', '.join(self.names) or '(names are missing)'} once, "
                 f"got {', '.join(self.order)}."
             )
+
+    def _check_differences(self) -> None:
+        """Raise a ValueError unless differences are of columns in their order."""
+        for each in self.within:
+            known = [self.names[j] for j in self.columns] if self.names else []
+            later = known[known.index(each.earlier) + 1 :] if each.earlier in known else []
+            if each.column not in later or isinstance(self.kinds[self.names.index(each.column)], ClosingSpeed):
+                raise ValueError(f"Expected within of a column after {each.earlier!r} in order, got {each.column!r}.")
+            if not each.least < each.most:
+                raise ValueError(f"Expected a range of {each.column} - {each.earlier}, got {each.least}, {each.most}.")
 
     def _check_kind(self, what: str, j: int, kind: object) -> None:
         """Raise a ValueError unless the kind of column j, `what` in messages, is known and fits the others."""

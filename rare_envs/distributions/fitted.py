@@ -22,21 +22,26 @@ from rare_envs.distributions.mixture import (
 )
 from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, DistributionParameter
+from rare_envs.distributions.stratified import StratifiedDistribution, Stratum, read_part, write_part
 
-FileDistribution = TruncatedGaussianMixture | BetaDistribution
+FileDistribution = TruncatedGaussianMixture | BetaDistribution | ProductDistribution | StratifiedDistribution
 RecordT = TypeVar("RecordT")
 FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
 """Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""
 BETA_SHAPES = ("alpha", "beta")
 MAX_COVERING_REFITS = 30
 """Refits whose mixture reaches where failures under any of them lie: of 100, more take longer and reach no further."""
+PART_KEYS = ("share", "accepted")
+"""Keys of a stratum that a refit has of its own."""
 COORDINATE_KEYS = ("coordinates", "order")
 """Keys of a file that a refit may have of its own, where it has chosen other coordinates than its base."""
 
 
 def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
-    """Return the distribution of the kind that the keys of a file tell: Beta variables or a mixture."""
-    return BetaDistribution.from_dict(data) if "alpha" in data else TruncatedGaussianMixture.from_dict(data)
+    """Return the distribution of the kind that the keys of a file tell: strata, Beta variables, or a mixture."""
+    if "strata" in data:
+        return StratifiedDistribution.from_dict(data)
+    return BetaDistribution.from_dict(data) if "alpha" in data else cast(FileDistribution, read_part(data))
 
 
 def read_record(kind: type[RecordT], what: str, data: object) -> RecordT:
@@ -277,6 +282,11 @@ class FittedDistribution:
         return getattr(self.distribution, "blocks", ())
 
     @property
+    def strata(self) -> tuple[Stratum, ...]:
+        """Parts of the population with shares of their own, none if it has none; those of a refit are its own."""
+        return getattr(self.distribution, "strata", ())
+
+    @property
     def noise(self) -> NDArray[np.bool_]:
         """Mask of the columns that are noise, shape (d,): samplers may leave these as they are."""
         return cast(NDArray[np.bool_], getattr(self.distribution, "noise", np.zeros(self.dim, dtype=bool)))
@@ -347,7 +357,7 @@ class FittedDistribution:
         """Return the refits as one mixture with equal weights: what they predict for the next event.
 
         Mixtures of the same coordinates are cut to the box as a whole, see `pool_mixtures`; blocks that all refits
-        share stay as they are.
+        share stay as they are. Refits made of strata are not mixed: their shares are.
 
         Raises:
             ValueError: There are no refits, or they are no mixtures.
@@ -485,36 +495,69 @@ def _join_sibling(distributions: Sequence[Distribution], fitted: FittedDistribut
 
 
 def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribution:
-    """Return a refit, whose entries replace those of the base."""
-    wanted, own = (BETA_SHAPES, ()) if "alpha" in data else (COMPONENT_FIELDS, COORDINATE_KEYS)
+    """Return a refit, whose entries replace those of the base, or stratum by stratum those of its strata."""
+    if "strata" not in data:
+        return cast(FileDistribution, _read_with(f"refits[{i}]", refit, data, read_distribution))
+    parts, own = data["strata"], refit.get("strata") if isinstance(refit, Mapping) else None
+    if not isinstance(own, list | tuple) or len(own) != len(parts):
+        raise ValueError(f"Expected refits[{i}] with strata, one for each of its base, got {refit!r}.")
+    inherited = {"names": data.get("names")}
+    strata = [
+        Stratum(
+            part["name"],
+            each.get("share", part["share"]),
+            _read_with(f"refits[{i}], {part['name']}", each, {**inherited, **part}, read_part),
+        )
+        for each, part in zip(own, parts, strict=True)
+    ]
+    return StratifiedDistribution(tuple(strata), data["limits"], data["column"], data.get("less"))
+
+
+def _read_with(what: str, refit: object, data: Mapping[str, Any], read: Callable[[Mapping[str, Any]], Any]) -> Any:
+    """Return a refit or a stratum of one, with the entries of the base for what it does not have (`what` in messages).
+
+    A share and the deceleration accepted are its own, where the base has them.
+    """
+    wanted, own = (BETA_SHAPES, ()) if "alpha" in data else (COMPONENT_FIELDS, (*COORDINATE_KEYS, *PART_KEYS))
     if not isinstance(refit, Mapping):
-        raise ValueError(f"Expected refits[{i}] as an object with {', '.join(wanted)}, got {refit!r}.")
+        raise ValueError(f"Expected {what} as an object with {', '.join(wanted)}, got {refit!r}.")
     missing = [name for name in wanted if name not in refit]
     others = [str(name) for name in refit if name not in (*wanted, *own) and refit[name] != data.get(name)]
     if missing or others:
         wrong = f"no {', '.join(missing)}" if missing else f"{', '.join(others)} of its own"
-        raise ValueError(f"Expected refits[{i}] with {', '.join(wanted)}, for the rest as its base, got {wrong}.")
+        raise ValueError(f"Expected {what} with {', '.join(wanted)}, for the rest as its base, got {wrong}.")
     # Coordinates of its own come with an order of their own, or that of x.
     inherited = {k: v for k, v in data.items() if "coordinates" not in refit or k != "order"}
     try:
-        return read_distribution({**inherited, **refit})
+        return read({**inherited, **refit})
     except ValueError as error:
-        raise ValueError(f"refits[{i}]: {error}") from None
+        raise ValueError(f"{what}: {error}") from None
 
 
 def _to_dict(distribution: Distribution) -> dict[str, Any]:
     """Return the entries of a distribution of a kind that files hold."""
-    if not isinstance(distribution, TruncatedGaussianMixture | BetaDistribution):
-        raise ValueError(f"A file holds mixtures and Beta variables, no {type(distribution).__name__}.")
-    return distribution.to_dict()
+    if isinstance(distribution, StratifiedDistribution | BetaDistribution):
+        return distribution.to_dict()
+    return write_part(distribution)
 
 
 def _refit_entries(i: int, refit: Distribution, base: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a refit that are its own."""
     entries = _to_dict(refit)
-    if ("alpha" in entries) != ("alpha" in base) or any(entries[k] != base[k] for k in ("low", "high")):
+    if {"alpha", "strata"} & {*entries} != {"alpha", "strata"} & {*base}:
         raise ValueError(f"refits[{i}] has another box than its base, or is of another kind; a file holds one for all.")
-    own = {name: entries[name] for name in (BETA_SHAPES if "alpha" in base else COMPONENT_FIELDS)}
+    if "strata" in base:
+        pairs = zip(entries["strata"], base["strata"], strict=True)
+        return {"strata": [_own_entries(i, own, part) for own, part in pairs]}
+    return _own_entries(i, entries, base)
+
+
+def _own_entries(i: int, entries: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a refit, or of a stratum of one, that are its own."""
+    if any(entries[k] != base[k] for k in ("low", "high")):
+        raise ValueError(f"refits[{i}] has another box than its base, or is of another kind; a file holds one for all.")
+    kept = BETA_SHAPES if "alpha" in base else (*COMPONENT_FIELDS, *(key for key in PART_KEYS if key in base))
+    own = {name: entries[name] for name in kept}
     usual = {"coordinates": ["plain"] * len(entries["low"]), "order": []}  # as they are where not written
     theirs, ours = ({key: each.get(key, usual[key]) for key in COORDINATE_KEYS} for each in (entries, base))
     return own if theirs == ours else own | theirs

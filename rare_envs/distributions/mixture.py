@@ -71,7 +71,7 @@ class MappedMixture:
             ValueError: Wrong shape, or a point outside the box.
         """
         points = self.read_rows("x", x)
-        outside = ~((points >= self.low) & (points <= self.high))
+        outside = ~self.coordinates.contains(points)
         if outside.any():
             i, j = np.argwhere(outside)[0]
             raise ValueError(
@@ -411,7 +411,7 @@ def find_log_densities(mixtures: Sequence[TruncatedGaussianMixture], x: ArrayLik
     """Return the log densities of R mixtures in the same coordinates, each of K components, (n, d) -> (R, n)."""
     own = mixtures[0]
     points = own.read_rows("x", x)
-    inside = np.flatnonzero(((points.T >= own.low[:, None]) & (points.T <= own.high[:, None])).all(axis=0))
+    inside = np.flatnonzero(own.coordinates.contains(points).all(axis=1))
     out = np.full((len(mixtures), len(points)), -np.inf)
     size = max(1, CHUNK // (len(mixtures) * len(own.weights)))
     for rows in (inside[start : start + size] for start in range(0, len(inside), size)):
@@ -491,7 +491,7 @@ def _reorder(
         return mixture
     places = [own.columns.index(column) for column in columns]
     order = tuple(names[column] for column in columns)
-    coordinates = Coordinates(own.low, own.high, own.kinds, own.names or names, order)
+    coordinates = Coordinates(own.low, own.high, own.kinds, own.names or names, order, own.within)
     means, covariances = mixture.means[:, places], mixture.covariances[:, places][:, :, places]
     return TruncatedGaussianMixture(mixture.weights, means, covariances, coordinates=coordinates)
 

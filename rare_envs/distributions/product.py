@@ -55,6 +55,19 @@ class NoiseDistribution:
         return self
 
 
+def box_of(distribution: Any) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of the box of a distribution; of columns of noise, infinite ones.
+
+    Example:
+        >>> box_of(NoiseDistribution(1))[0].tolist()
+        [-inf]
+    """
+    if hasattr(distribution, "low"):
+        return np.asarray(distribution.low), np.asarray(distribution.high)
+    free = np.full(distribution.dim, np.inf)
+    return -free, free
+
+
 @dataclass(frozen=True, eq=False)
 class ProductDistribution:
     """Independent blocks side by side.
@@ -78,6 +91,29 @@ class ProductDistribution:
         """Mask of the columns that are noise, shape (d,): samplers may leave these as they are."""
         is_noise = [isinstance(block, NoiseDistribution) for block in self.blocks]
         return np.repeat(is_noise, [block.dim for block in self.blocks])
+
+    @property
+    def low(self) -> FloatArray:
+        """Lower ends of the box, shape (d,)."""
+        return np.concatenate([box_of(block)[0] for block in self.blocks])
+
+    @property
+    def high(self) -> FloatArray:
+        """Upper ends of the box, shape (d,)."""
+        return np.concatenate([box_of(block)[1] for block in self.blocks])
+
+    @property
+    def strata(self) -> tuple[Any, ...]:
+        """Strata of the one block that has some, each beside the other blocks; none otherwise."""
+        places = [i for i, block in enumerate(self.blocks) if getattr(block, "strata", ())]
+        if len(places) != 1:
+            return ()
+        (i,) = places
+        before, behind = self.blocks[:i], self.blocks[i + 1 :]
+        return tuple(
+            each._replace(base=ProductDistribution((*before, *getattr(each.base, "blocks", (each.base,)), *behind)))
+            for each in self.blocks[i].strata
+        )
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, d)."""
