@@ -109,9 +109,10 @@ CHANGES: Mapping[str, Change] = {
     "never noticed": Change(("unseen",), {}, {"oblivious": 1.0}),
 }
 """Parts by name; "" is the model as it is. Of a change other than it, `CHANGED_SHARE` of the draws are driven."""
-CHANGED_SHARE = 0.2
-EGOS: Mapping[str, float] = {HUMAN: 1.0, BRACKET: 1.0, "idm": 1.0, "imitation": 0.01, "vision": 0.002}
-"""Egos, and their share of the draws: networks are slow, cameras slower."""
+CHANGED_SHARE = 0.3
+EGOS: Mapping[str, float] = {HUMAN: 1.0, BRACKET: 1.0, "idm": 1.0, "imitation": 0.03, "vision": 1e-4}
+"""Egos, and their share of the draws: networks are slow, cameras take a quarter of a second. Those that get less than
+all of them are driven at the first site alone."""
 OWN_EGO_SHARE = 0.02
 CHUNK = 20_000
 
@@ -240,6 +241,8 @@ def plan(sites: Sequence[str], draws: int, egos: Sequence[str], changes: bool = 
         here = {name: each for name, each in STRATA.items() if site in find_scenario(each.env_id).bases}
         for ego in egos:
             share = EGOS.get(ego, OWN_EGO_SHARE)
+            if share < 1.0 and site != sites[0]:
+                continue
             found |= {Drawn(site, name, ego): round(draws * share * each.share) for name, each in here.items()}
         first = site == sites[0]
         for name, change in CHANGES.items() if changes and first else ():
