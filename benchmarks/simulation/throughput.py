@@ -36,15 +36,22 @@ OUT = Path("build/throughput.json")
 LEAST_ESTIMATES = 5
 """Of which the median is judged: one in three is repeated under the pool of the refits."""
 CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "Highway"))
+CUT_IN_V1 = "rare_envs/CutIn-v1"
 HORIZON = 20.0
 """Episodes of 200 ticks, as in the published baselines."""
 TICKS = 200
-ROADS = {CAR_FOLLOWING: reference.car_following_road, CUT_IN: reference.cut_in_road}
+ROADS = {
+    CAR_FOLLOWING: reference.car_following_road,
+    CUT_IN: reference.cut_in_road,
+    CUT_IN_V1: lambda row: reference.cut_in_road(row[:6]),  # as many vehicles, whose script is simpler
+}
 FLOORS = {
     "car_following_idm": 1000.0,
     "car_following_idm_compiled": 20000.0,
     "cut_in_idm": 1000.0,
     "cut_in_idm_compiled": 8000.0,
+    "cut_in_v1_idm": 300.0,
+    "cut_in_v1_idm_compiled": 2000.0,
     "car_following_ppo": 400.0,
     "car_following_ppo_compiled": 700.0,
     "env_step": 20.0,
@@ -356,12 +363,14 @@ def main(
     results["camera_64"] = measure_camera(64, rounds)
     results["camera_64_weather"] = measure_camera(64, rounds, weather=True)
     if not (only_highway or only_camera):
-        scripts = {env_id: count_bound(machine, env_id, horizon=HORIZON) for env_id in (CAR_FOLLOWING, CUT_IN)}
-        for name, env_id in (("car_following", CAR_FOLLOWING), ("cut_in", CUT_IN)):
+        named = {"car_following": CAR_FOLLOWING, "cut_in": CUT_IN, "cut_in_v1": CUT_IN_V1}
+        scripts = {env_id: count_bound(machine, env_id, horizon=HORIZON) for env_id in named.values()}
+        for name, env_id in named.items():
             for core, ending in (("torch", ""), ("numba", "_compiled")):
                 row = rollout_ratio(env_id, core, rounds)
                 results[f"{name}_idm{ending}"] = stand_by_bound(row, scripts[env_id])
-            results[f"answer_{name}"] = measure_answer(env_id, rounds)
+            if env_id in ANSWER_BASES:
+                results[f"answer_{name}"] = measure_answer(env_id, rounds)
         bound = count_bound(machine, CAR_FOLLOWING, ego=ppo(CAR_FOLLOWING), horizon=HORIZON)
         for core, ending in (("torch", ""), ("numba", "_compiled")):
             results[f"car_following_ppo{ending}"] = stand_by_bound(policy_ratio(core, rounds), bound)

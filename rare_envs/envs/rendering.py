@@ -73,6 +73,12 @@ def find_crashed(episode: Episode, row: int = 0) -> Collection[int]:
     return {0, *(overlaps(state, episode.road)[0].nonzero().flatten() + 1).tolist()}
 
 
+def find_signals(world: World, episode: Episode, row: int = 0) -> set[int]:
+    """Return the vehicles with their indicator on, in a row."""
+    signals = world.scenario.signals
+    return set() if signals is None else {j + 1 for j, on in enumerate(signals(episode.state)[row].tolist()) if on}
+
+
 def make_network(road: Road, x: float) -> Any:
     """Return HighwayEnv's road network of the lanes around x [m]; a curve in straight pieces."""
     from highway_env.road.lane import LineType, StraightLane
@@ -110,6 +116,8 @@ _MARGIN = 4.0
 Colour = tuple[int, int, int]
 AGENT: Colour = (200, 0, 150)
 """Outline of vehicles other than the ego that an agent drives, HighwayEnv's purple."""
+SIGNAL: Colour = (255, 150, 0)
+"""Outline of vehicles with their indicator on, amber."""
 _PAPER: Colour = (255, 255, 255)
 _INK: Colour = (30, 30, 30)
 _Outlines = dict[str, tuple[Colour, Collection[int]]]
@@ -172,12 +180,13 @@ class Renderer:
     ) -> NDArray[np.uint8]:
         """Return the image, (H, FRAME_WIDTH, 3), of one of B episodes, a time after its start [s].
 
-        Vehicles that agents drive, and those that have `crashed` (None: the ego, if it has, and whom it touches), are
+        Vehicles that signal, that agents drive, and those that have `crashed` (None: the ego, if it has, and whom it touches), are
         outlined.
         """
         if self._pygame is None:
             self._open()
         outlines: _Outlines = {
+            "indicator on": (SIGNAL, find_signals(self._world, episode, row) - set(agents)),
             "driven by an agent": (AGENT, set(agents) - {0}),
             "crashed": (as_rgb(CRASH_COLOUR), find_crashed(episode, row) if crashed is None else crashed),
         }

@@ -87,7 +87,9 @@ ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = single(0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.
 BODY_LENGTH, _HALF_LENGTH, _HALF_WIDTH = single(VEHICLE_LENGTH, VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
 NEAREST, _MAX_SINE, _MAX_STEERING = single(NEAR_ZERO, MAX_SLIP_SINE, STEERING_LIMIT)
 _MAX_HEADING, _HEADING_GAIN, _LATERAL_GAIN = single(MAX_HEADING_COMMAND, 1.0 / TAU_HEADING, -TAU_LATERAL)
-_LEAST_GAP, _LEAST_SPEED, _LEAST_RATIO, _FAR, _LEAST_FREE = single(GAP_MIN, STILL, MIN_RATIO, DIAGONAL, 1e-3)
+_LEAST_GAP, _LEAST_SPEED, _LEAST_RATIO, _FAR, _LEAST_FREE, _NOTHING = single(
+    GAP_MIN, STILL, MIN_RATIO, DIAGONAL, 1e-3, -20.0
+)
 
 
 class IDMNumbers(NamedTuple):
@@ -253,7 +255,6 @@ def improved_acceleration(
 ) -> float:
     """Return the acceleration [m/s^2] behind a steady lead: `rare_envs.control.idm.improved_acceleration`."""
     a, interaction = idm.max_acceleration, idm_interaction(idm, speed, gap, closing, ratio)
-    power = fourth_power(ratio) if idm.exponent == FOUR else ratio**idm.exponent
     near = a - interaction * a
     if ratio > ONE:
         above = (ratio ** (-a * idm.exponent / comfortable) - ONE) * comfortable
@@ -261,11 +262,12 @@ def improved_acceleration(
     elif interaction >= ONE:
         improved = near
     else:
-        below = (ONE - power) * a
-        share = math.exp(math.log(max(interaction, _LEAST_RATIO)) * (a / max(below, _LEAST_FREE)))
-        improved = below - below * share
+        improved = (ONE - (fourth_power(ratio) if idm.exponent == FOUR else ratio**idm.exponent)) * a
+        free = max(improved, _LEAST_FREE)
+        if (interaction - ONE) * a > _NOTHING * free:  # else the share is less than what all is rounded by
+            improved -= improved * math.exp(math.log(max(interaction, _LEAST_RATIO)) * (a / free))
     approach = at_least(closing, ZERO)
-    heuristic = -(approach * approach) / (max(gap, NEAREST) * TWO)
+    heuristic = ZERO if approach == ZERO else -(approach * approach) / (max(gap, NEAREST) * TWO)
     less = improved - heuristic
     if less < ZERO:
         milder = math.tanh(less / comfortable) * comfortable + heuristic

@@ -193,34 +193,40 @@ def human_cut_in(rows: Rows, idm: IDMNumbers, model: CutterNumbers, dt: float) -
             acceleration = eq.improved_acceleration(
                 idm, model.comfortable, model.coolness, speed[row], gap, closing, ratio
             )
-        distance, approach = x[row] - ego_x[row], eq.at_least(ego_speed[row] - speed[row], eq.ZERO)
-        behind = distance - eq.BODY_LENGTH
-        needed = approach * approach / (eq.TWO * eq.at_least(behind, eq.NEAREST))
-        pressed = (behind >= eq.ZERO) & (needed > model.most_braking)
-        if over[row] >= eq.ZERO:
-            over[row] += eq.ONE
-        elif y[row] < model.line:
-            over[row] = eq.ZERO
-        sees = over[row] * dt >= delay[row]
-        taken = (way[row] < length[row]) & sees & ((abs(distance) < model.reach) | pressed)
-        patience = model.patience if delay[row] == -_INFINITE else eq.ZERO
-        back = taken & (waited[row] >= patience)
-        waited[row] = waited[row] + eq.ONE if taken else eq.ZERO
-        turned[row] = eq.ONE if back else turned[row]
-        ahead = speed[row] * cos[row] * dt
-        after = eq.at_least(way[row] - ahead if back else way[row] + ahead, eq.ZERO)
-        way[row] = min(after, length[row])
+        over[row] = over[row] + eq.ONE if over[row] >= eq.ZERO else (eq.ZERO if y[row] < model.line else over[row])
+        ahead, back = speed[row] * cos[row] * dt, False
+        if way[row] < length[row]:
+            if over[row] * dt >= delay[row] and is_taken(x[row] - ego_x[row], ego_speed[row] - speed[row], model):
+                patience = model.patience if delay[row] == -_INFINITE else eq.ZERO
+                back = waited[row] >= patience
+                waited[row] += eq.ONE
+            else:
+                waited[row] = eq.ZERO
+            turned[row] = eq.ONE if back else turned[row]
+            after = eq.at_least(way[row] - ahead if back else way[row] + ahead, eq.ZERO)
+            way[row] = min(after, length[row])
+            y[row], slope[row] = bezier(way[row], length[row], offset[row])
+            slope[row] = -slope[row] if back else slope[row]
+        else:
+            waited[row], y[row], slope[row] = eq.ZERO, eq.ZERO, eq.ZERO
         x[row] += ahead
         speed[row] = eq.at_least(speed[row] + acceleration * dt, eq.ZERO)
         time[row] += dt
         lead_x[row] += lead_speed[row] * dt
-        lead_speed[row] = first_speed[row] - loss[row] * eq.lost_share(time[row] - onset[row], lasting[row])
+        if loss[row] > eq.ZERO:
+            lead_speed[row] = first_speed[row] - loss[row] * eq.lost_share(time[row] - onset[row], lasting[row])
         lead_y[row], lead_heading[row], lead_cos[row] = eq.ZERO, eq.ZERO, eq.ONE
-        y[row], slope[row] = bezier(way[row], length[row], offset[row])
-        slope[row] = -slope[row] if back else slope[row]
         bends |= (slope[row] != eq.ZERO) | (heading[row] != eq.ZERO)
     if bends:
         turn_cutters(rows)
+
+
+@compiled
+def is_taken(distance: float, closing: float, model: CutterNumbers) -> bool:
+    """Return whether the place that the cutter moves to is taken: part of `CutterModel._decide`."""
+    behind, approach = distance - eq.BODY_LENGTH, eq.at_least(closing, eq.ZERO)
+    needed = approach * approach / (eq.TWO * eq.at_least(behind, eq.NEAREST))
+    return abs(distance) < model.reach or (behind >= eq.ZERO and needed > model.most_braking)
 
 
 @compiled

@@ -66,7 +66,7 @@ def env_id_of(name: str) -> str:
 
 def split_version(env_id: str) -> tuple[str, int | None]:
     """Return an id without its version, and the version; None where it has none."""
-    found = re.fullmatch(r"(.*)-v(\d+)", env_id)
+    found = re.fullmatch(r"(.*)[-_]v(\d+)", env_id)
     return (found[1], int(found[2])) if found else (env_id, None)
 
 
@@ -118,12 +118,30 @@ def is_highway_env_id(env_id: object) -> bool:
 
 
 def complete_id(env_id: str) -> str:
-    """Return an id with its namespace: of "CutIn-v0" the one that ends so; else as it is, without "rare_envs:"."""
-    if isinstance(env_id, str):  # what is no id is refused where the scenario is looked for
-        env_id = env_id.removeprefix("rare_envs:")
-    known = (each for name in SCENARIOS for each in (name, kinematics_id(name)))
-    found = [each for each in known if each.rpartition("/")[2] == env_id]
-    return found[0] if len(found) == 1 else env_id
+    """Return the registered id for a spelling of it; else what is given, without "rare_envs:".
+
+    Namespace and version may be left out, and words be joined in any way: "cut_in", "CutIn" and "cut-in-v1" are
+    "rare_envs/CutIn-v1". Without a version it is the newest; names in several namespaces need theirs.
+    """
+    if not isinstance(env_id, str):  # is refused where the scenario is looked for
+        return env_id
+    env_id = env_id.removeprefix("rare_envs:")
+    if env_id in SCENARIOS or is_highway_env_id(env_id):
+        return env_id
+    namespace, name, version = _spell(env_id)
+    found: dict[str, tuple[int, str]] = {}  # the newest by namespace
+    for each in (each for known in SCENARIOS for each in (known, kinematics_id(known))):
+        own, its_name, its_version = _spell(each)
+        if its_name == name and namespace in ("", own) and version in (None, its_version):
+            found[own] = max(found.get(own, (-1, "")), (its_version or 0, each))
+    return next(iter(found.values()))[1] if len(found) == 1 else env_id
+
+
+def _spell(env_id: str) -> tuple[str, str, int | None]:
+    """Return namespace, bare letters and version of an id."""
+    family, version = split_version(env_id)
+    namespace, _, name = family.rpartition("/")
+    return namespace, re.sub(r"[\W_]", "", name).lower(), version
 
 
 HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}

@@ -113,7 +113,7 @@ def is_recordable(world: World, driver: Driver) -> bool:
     """Return whether nothing about a rollout but x can change: as drivers' classes say, for nothing of a user's."""
     drivers = (driver,) if world.background is None else (driver, world.background)
     scenario = world.scenario
-    scripts = (scenario.initial, scenario.others, scenario.driven, scenario.signals)
+    scripts = (scenario.initial, scenario.others, scenario.driven, scenario.signals, scenario.evades)
     own = (script is None or str(getattr(script, "__module__", "")).startswith("rare_envs.") for script in scripts)
     measure = world.measurement.episode_measure
     read = (measure.measure, measure.order) if isinstance(measure, TermTracker) else (measure,)

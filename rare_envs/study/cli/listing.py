@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
@@ -14,6 +15,7 @@ from rich.text import Text
 import samplers
 from agents.learned.networks import HEAD_SIZE
 from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.space import Parameter
 from rare_envs.exposure import explain_no_frequency, read_source
 from rare_envs.measures.base import Measure, TraceMeasure
 from rare_envs.measures.registry import MEASURES
@@ -69,7 +71,7 @@ def list_names() -> dict[str, Any]:
         n_noise = noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)
         environments[env_id] = {
             "kinematics_id": kinematics_id(env_id),
-            "parameters": [asdict(parameter) for parameter in scenario.parameters],
+            "parameters": [_describe(parameter) for parameter in scenario.parameters],
             "vehicles": list(scenario.vehicle_names),
             "bases": list(scenario.bases),
             "drivers": scenario.drivers,
@@ -79,12 +81,18 @@ def list_names() -> dict[str, Any]:
     return {
         "environments": environments,
         "highway_env": list(HIGHWAY_ENV_IDS),
-        "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
+        "weather": [_describe(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
         "drivers": DRIVERS,
         "measures": {name: _first_line(measure) for name, measure in measures.items()},
     }
+
+
+def _describe(parameter: Parameter) -> dict[str, Any]:
+    """Return a parameter as JSON-ready values; None for an end of its range that there is not."""
+    ends = {"low": parameter.low, "high": parameter.high}
+    return asdict(parameter) | {name: end if math.isfinite(end) else None for name, end in ends.items()}
 
 
 def _first_line(documented: object) -> str:
@@ -156,7 +164,8 @@ def _print_parameters(console: Console, title: str, parameters: list[dict[str, A
     rows = []
     for each in parameters:
         name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
-        rows.append((name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"]))
+        ends = "any" if each["low"] is None else f"{each['low']:g} to {each['high']:g}"
+        rows.append((name, each["unit"], ends, each["meaning"]))
     _print_table(console, title, ["parameter", "unit", "range", "meaning"], rows)
 
 

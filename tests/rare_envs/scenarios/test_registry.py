@@ -46,15 +46,27 @@ def test_scenarios_by_id_and_by_name_are_the_same() -> None:
     for env_id, name in (("rare_envs/HardBrake-v0", "hard_brake"), ("rare_envs/CutIn-v1", "cut_in")):
         assert find_scenario(env_id) is scenario_named(name) is SCENARIOS[env_id]
         assert scenario_named(name).name == name
-    with pytest.raises(ValueError, match=r"^Unknown scenario 'cutin' \(did you mean 'cut_in'\?\); there are car_foll"):
-        scenario_named("cutin")
+    with pytest.raises(
+        ValueError, match=r"^Unknown scenario 'cut_ins' \(did you mean 'cut_in'\?\); there are car_foll"
+    ):
+        scenario_named("cut_ins")
+
+
+@pytest.mark.parametrize("name", ["CutIn", "cut-in", "cut_in", "cutin", "CutIn-v1", "cut_in-v1", "cut_in_v1"])
+@pytest.mark.parametrize("namespace", ["", "rare_envs/", "rare_envs:rare_envs/"])
+def test_every_spelling_of_a_name_means_the_same(namespace: str, name: str) -> None:
+    assert complete_id(namespace + name) == "rare_envs/CutIn-v1"
+    assert find_scenario(namespace + name) is scenario_named(namespace + name) is SCENARIOS["rare_envs/CutIn-v1"]
+    assert complete_id("highway") == "rare_envs/Highway-v0"
+    assert complete_id("highway-v0") == "highway-v0"  # HighwayEnv's own id
+    assert complete_id("cut_in_kinematics") == "rare_envs/CutIn-kinematics-v1"
 
 
 @pytest.mark.parametrize(
     ("env_id", "message"),
     [
         ("CutInn-v0", r"^Unknown environment 'CutInn-v0' \(did you mean 'rare_envs/CutIn-v0'"),
-        ("highway", r"^Unknown environment 'highway'.*; the environments are rare_envs/CarFollowing-v0, rare_envs"),
+        ("highways", r"^Unknown environment 'highways'.*; the environments are rare_envs/CarFollowing-v0, rare_envs"),
         (None, "^Unknown environment None; the environments are rare_envs/CarFollowing-v0, "),
         (["rare_envs/CutIn-v0"], r"^Unknown environment \['rare_envs/CutIn-v0'\]"),
         ("rare_envs/CutIn-kinematics-v0", r"here take 'rare_envs/CutIn-v0' with observation 'kinematics' and action '"),
