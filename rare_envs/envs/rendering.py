@@ -180,8 +180,8 @@ class Renderer:
     ) -> NDArray[np.uint8]:
         """Return the image, (H, FRAME_WIDTH, 3), of one of B episodes, a time after its start [s].
 
-        Vehicles that signal, that agents drive, and those that have `crashed` (None: the ego, if it has, and whom it touches), are
-        outlined.
+        Vehicles that signal, that agents drive, and those that have `crashed` (None: the ego, if it has, and whom it
+        touches), are outlined.
         """
         if self._pygame is None:
             self._open()

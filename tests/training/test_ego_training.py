@@ -83,7 +83,7 @@ def test_bad_requests_are_refused_before_work(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "file").write_text("")
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"steps": 0}, "steps >= 1, got 0"),
-        ({"env_id": "CutIn", "out": "new/ego"}, "did you mean 'rare_envs/CutIn-v1'"),
+        ({"env_id": "CutInn-v1", "out": "new/ego"}, "did you mean 'rare_envs/CutIn-v1'"),
         ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
         ({"num_envs": 0}, "num_envs >= 1, got 0"),
         ({"out": "."}, "got the folder"),

@@ -11,13 +11,13 @@ import numpy as np
 from rare_envs.scenarios.registry import scenario_named
 
 MEANS = {
-    "cut_in": (20.0, 14.0, 20.0, 8.0, 30.0, 3.5, 4.0),
-    "hard_brake": (15.0, 8.0, 7.0),
+    "cut_in": (20.0, 14.0, 20.0, 9.5, 30.0, 3.5, 4.0, -5.0, -3.0, 0.0, 0.0, 0.0, 0.0),  # who does not look or notice
+    "hard_brake": (25.0, 12.0, 9.0, 40.0),
     "car_following": (20.0, 10.0, 26.0),
 }
 SPREADS = {
-    "cut_in": (2.0, 2.0, 2.0, 2.0, 5.0, 0.2, 0.5),
-    "hard_brake": (2.0, 2.0, 1.0),
+    "cut_in": (2.0, 2.0, 2.0, 2.0, 5.0, 0.2, 0.5, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0),
+    "hard_brake": (2.0, 2.0, 0.5, 2.0),
     "car_following": (2.0, 2.0, 5.0),
 }
 """Of independent normal variables, so that between a tenth and a half of the scenarios end in a crash of the IDM."""
@@ -44,8 +44,8 @@ def fitted_entries(scenario: str, spread: float = 0.3, shift: float = 0.0, **cha
     source = {"site": f"site of {scenario}", "date": "2005-06-15", "data": f"data of {scenario}", "licence": "CC0"}
     entries = {
         "names": [p.name for p in parameters],
-        "low": [p.low for p in parameters],
-        "high": [p.high for p in parameters],
+        "low": [max(p.low, -150.0) for p in parameters],
+        "high": [min(p.high, 150.0) for p in parameters],
         **shape,
         "means": [mean.tolist()],
         "refits": [{**shape, "means": [each.tolist()]} for each in moved],

@@ -68,7 +68,7 @@ def test_a_limit_of_the_rate_is_compared_with_its_one_sided_ends(bases: dict[str
 
 
 def test_nothing_failed(tmp_path: Path) -> None:
-    base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
+    base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0, 5.0]])
     report = run(prepare(question(base, max_sim=100)))
     assert report.estimate.p == 0.0 == report.rate.per_hour
     assert report.rate.interval_per_hour[1] >= 42 / 5.64 * report.estimate.interval[1]

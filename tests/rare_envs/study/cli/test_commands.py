@@ -46,8 +46,9 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
         learned = rare_envs.DrivingProblem(env_id, drivers="mgail").space
         added = [(each["name"], each["size"]) for each in environment["of_learned_drivers"]]
         assert added == list(zip(learned.names, learned.sizes, strict=True))[len(listed) :]
-        for end in ("low", "high"):
-            expected = np.repeat([each[end] for each in listed], [each["size"] for each in listed])
+        for end, none in (("low", -np.inf), ("high", np.inf)):
+            ends = [none if each[end] is None else each[end] for each in listed]
+            expected = np.repeat(ends, [each["size"] for each in listed])
             assert expected.tolist() == getattr(space, end)[: len(expected)].tolist()
         assert environment["kinematics_id"] in gym.registry
     assert all(name in gym.registry for name in entries["highway_env"])
@@ -84,7 +85,9 @@ def test_one_kind_is_explained_alone(cli: Cli) -> None:
 def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     bases = {
         "us101": fitted_entries("hard_brake"),
-        "plain": {**json.loads(HARD_BRAKE.bases["us101-all-brakings"].read_text()), "provenance": None},
+        "plain": fitted_entries(
+            "hard_brake", refits=None, events=None, family=None, frequency=None, checks=None, provenance=None
+        ),
     }
     monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
     text = " ".join(cli("bases", "rare_envs/HardBrake-v0").stdout.split())
