@@ -151,7 +151,7 @@ def split_by_stratum(estimate: samplers.Estimate, base: Any) -> tuple[PartValue,
         return ()
     failures = analysis.weigh_failures(estimate)
     which = stratum_of(strata, failures.x) if len(failures.x) else np.empty(0)
-    for number, part in enumerate(getattr(estimate, "parts", ())):
+    for number, part in enumerate(estimate.parts):
         low, high = part.interval
         value, cov, uncertainty = part.share * part.p, part.cov, None
         here = (which == number).astype(np.float64)

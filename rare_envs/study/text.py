@@ -244,7 +244,8 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
         console.print(_write_row("limit", str(report.verdict)), style="bold")
     fixed = f"no interval: {report.study.base_name!r} has no refits to events, so p takes it as the truth"
     lines = list(indent_lines(estimate.base_uncertainty or f"base distribution  {fixed}"))
-    for rows in (_list_other_bases(report), _list_rates(report, details), _list_effort(report, details)):
+    parts = [("strata" if number == 0 else "", str(part)) for number, part in enumerate(estimate.parts)]
+    for rows in (parts, _list_other_bases(report), _list_rates(report, details), _list_effort(report, details)):
         lines += [_write_row(*row) for row in rows]
     lines += [_write_row(*row) for row in (*_list_kinds(report, details), *_list_faults(report))]
     lines += [f"  {line}" for line in _describe_failure(report, details)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 
@@ -15,7 +14,8 @@ from scipy import stats
 
 import rare_envs
 import samplers
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions import CutNormals, EventCounts, EventFrequency, FittedDistribution, StratifiedDistribution
+from rare_envs.distributions.stratified import Stratum
 from rare_envs.exposure import CollisionProbability, CollisionRate, ModelCount, calibration
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
@@ -188,42 +188,36 @@ def test_a_rate_has_two_digits_and_with_its_interval_one_form() -> None:
         assert format_with_interval(value, interval) == text
 
 
-class Halves(samplers.StandardNormal):
-    """N(0, 1) as its two halves, with refits N(m, 1), which have shares of their own."""
-
-    family, clusters, fitted_to = "normal", 40, "40 events of 40 scenes"
-
-    def __init__(self, mean: float = 0.0, refits: tuple[float, ...] = ()) -> None:
-        super().__init__(1)
-        self.mean, self.refits = mean, [Halves(each) for each in refits]
-        below = stats.norm.cdf(0.0, mean)
-        self.strata = [
-            SimpleNamespace(name=name, share=share, base=SimpleNamespace(log_prob=partial(self._half, side, share)))
-            for name, side, share in (("below", -1, below), ("above", 1, 1 - below))
-        ]
-
-    def _half(self, side: int, share: float, x: np.ndarray) -> np.ndarray:
-        return np.where(np.sign(x[:, 0]) == side, self.log_prob(x) - np.log(share), -np.inf)
-
-    def log_prob(self, x: np.ndarray) -> np.ndarray:
-        return stats.norm.logpdf(x[:, 0], self.mean)
+def halves(share: float) -> StratifiedDistribution:
+    """The negative and the positive half of N(0, 1), the first with this share."""
+    ends = ([-np.inf], [0.0]), ([0.0], [np.inf])
+    below, above = (CutNormals(low, high) for low, high in ends)
+    return StratifiedDistribution(
+        (Stratum("below", share, below), Stratum("above", 1.0 - share, above)), [0.0], column=0
+    )
 
 
 def test_the_parts_of_p_are_those_of_its_strata_with_the_error_of_their_shares() -> None:
-    """P[x > 1] + P[x < -2] under N(0, 1), and under N(m, 1): by the normal distribution, within five deviations."""
-    base, n = Halves(refits=(-0.1, 0.0, 0.1)), 40_000
+    """P[x < -2] and P[x > 1]: s 2 Phi(-2) and (1 - s) 2 Phi(-1) with shares s; within six deviations."""
+    shares = (0.4, 0.5, 0.6)
+    base = FittedDistribution(
+        distribution=halves(0.5),
+        refits=tuple(map(halves, shares)),
+        events=EventCounts(used=(40,), clusters=40, cluster="scene"),
+        family="halves",
+    )
     problem = SimpleNamespace(dim=1, base=base, evaluate=lambda x: np.minimum(1.0 - x[:, 0], x[:, 0] + 2.0))
-    estimate = samplers.estimate(problem, "mc", seed=0, max_sim=n)
-    parts = [SimpleNamespace(name=each.name, share=each.share, p=0.1, cov=0.1, interval=(0, 1)) for each in base.strata]
-    object.__setattr__(estimate, "parts", parts)
-    below, above = split_by_stratum(estimate, base)
-    for part, of in (
-        (below, lambda mean: stats.norm.cdf(-2.0 - mean)),
-        (above, lambda mean: stats.norm.sf(1.0 - mean)),
-    ):
-        for found, mean in zip(part.base.value_refits, (-0.1, 0.0, 0.1), strict=True):
-            assert found == pytest.approx(of(mean), abs=6 * math.sqrt(of(mean) / n))
-    assert (below.value, above.value) == (pytest.approx(0.05), pytest.approx(0.05))
+    estimate = samplers.estimate(problem, "mc", seed=0, max_sim=40_000)
+    expected = {"below": 2 * stats.norm.cdf(-2.0), "above": 2 * stats.norm.cdf(-1.0)}
+    parts = {part.name: part for part in split_by_stratum(estimate, base)}
+    assert sum(part.value for part in parts.values()) == pytest.approx(estimate.p)
+    for name, of in (("below", shares), ("above", shares[::-1])):
+        part = parts[name]
+        spread = 6 * part.cov * part.value
+        assert part.value == pytest.approx(0.5 * expected[name], abs=spread)
+        assert part.interval[0] < 0.5 * expected[name] < part.interval[1]
+        for found, share in zip(part.base.value_refits, of, strict=True):
+            assert found == pytest.approx(share * expected[name], abs=2 * spread)
 
 
 def test_each_event_stands_beside_people_in_it() -> None:
