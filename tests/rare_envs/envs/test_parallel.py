@@ -60,7 +60,12 @@ def test_pettingzoo_render(env_id, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "agents"), [(CUT_IN, ["ego"]), pytest.param("rare_envs/Highway-v0", None, marks=pytest.mark.slow)]
+    ("env_id", "agents"),
+    [
+        (CUT_IN, ["ego"]),
+        ("rare_envs/CutIn-v1", None),
+        pytest.param("rare_envs/Highway-v0", None, marks=pytest.mark.slow),
+    ],
 )
 def test_an_ego_alone_has_exactly_the_environment_of_one(env_id, agents):
     """To the last bit, until the ego's end: whether the others may not act or do not."""
@@ -86,6 +91,23 @@ def test_an_ego_alone_has_exactly_the_environment_of_one(env_id, agents):
                 assert data_equivalence(expected, tuple(each["ego"] for each in got), exact=True)
                 done = expected[2] or expected[3]
             assert "ego" not in several.agents
+
+
+def test_a_cutter_that_is_an_agent_goes_where_it_is_driven_and_keeps_off_once_it_is_released():
+    """It is beside the ego: the script would turn back after 0.6 s, the agent goes straight in."""
+    x = [20.0, 20.0, 20.0, -3.0, 60.0, 3.5, 4.0, *[0.0] * 6]
+    alone, driven = (rare_envs.parallel_env("rare_envs/CutIn-v1", agents=["cutter"]) for _ in range(2))
+    for env in (alone, driven):
+        env.reset(options={"x": x})
+    steer = np.array([0.0, -0.3], np.float32)
+    for tick in range(12):
+        alone.step({})
+        driven.step({"cutter": steer if tick < 5 else -steer})
+    assert alone.state()[1, 1] == 3.5 and alone.state()[2, 1] == 0.0
+    assert driven.state()[1, 1] < 3.0 < driven.state()[1, 0]
+    for _ in range(60):
+        driven.step({})
+    assert driven.state()[1, 1] == pytest.approx(4.0, abs=0.1)  # it keeps the lane that it was in, by IDM
 
 
 def test_who_crashes_leaves_and_the_others_drive_on():

@@ -12,6 +12,7 @@ from rare_envs.envs.rendering import (
     CRASH_COLOUR,
     FRAME_WIDTH,
     ROLE_COLOURS,
+    SIGNAL,
     TEXT_HEIGHT,
     Renderer,
     as_rgb,
@@ -68,6 +69,20 @@ def test_the_picture_shows_where_vehicles_are_and_who_has_crashed():
     crashed = colours(road_of(renderer.draw(episode, row=1)))
     assert as_rgb(CRASH_COLOUR) in crashed and as_rgb(CRASH_COLOUR) not in colours(image)
     assert {as_rgb(ROLE_COLOURS[role]) for role in ("ego", "lead")} <= crashed  # each is still who it is
+
+
+def test_indicators_are_shown_until_the_change_is_over_and_not_of_vehicles_that_agents_drive():
+    world, _ = set_up("rare_envs/CutIn-v1")
+    x = torch.tensor([[20.0, 20.0, 20.0, 10.0, 60.0, 3.5, 4.0, 0.0, 0.0, z, 9.0, 0.0, 0.0] for z in (0.0, -1.0)])
+    renderer, start = Renderer(world), world.start(x)
+    over = start
+    for _ in range(45):
+        over = world.step(over, torch.zeros(2, 2))
+    on, off, late = (
+        colours(road_of(renderer.draw(each, row=row))) for each, row in ((start, 0), (start, 1), (over, 0))
+    )
+    assert SIGNAL in on and SIGNAL not in off | late
+    assert SIGNAL not in colours(road_of(renderer.draw(start, agents=[1])))
 
 
 def test_the_numbers_in_the_picture_by_hand():

@@ -20,6 +20,7 @@ SHORT = 3.0
 CASES: dict[str, tuple[str, dict[str, Any], int]] = {
     "car-following": ("rare_envs/CarFollowing-v0", {"base": "highway"}, 150),
     "cut-in": ("rare_envs/CutIn-v0", {"base": "highway"}, 150),
+    "cut-in of people": ("rare_envs/CutIn-v1", {}, 150),
     "hard brake": ("rare_envs/HardBrake-v0", {}, 150),
     "highway": ("rare_envs/Highway-v0", {}, 24),
     "highway, imitation": ("rare_envs/Highway-v0", {"ego": "imitation", "noise": "fixed"}, 24),

@@ -114,7 +114,17 @@ def highway() -> Drive:
     return drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0])
 
 
-@pytest.fixture(params=["cut_in", "highway"])
+@pytest.fixture(scope="module")
+def aborted() -> Drive:
+    """A cutter that turns back from beside the ego, and goes on behind it."""
+    x = np.array([22.0, 16.0, 20.0, -3.0, 60.0, 3.5, 4.0, *[0.0] * 6])
+    drive = drive_again(DrivingProblem("rare_envs/CutIn-v1"), x)
+    y = drive.position[:, 1, 1]
+    assert y[6] < y[0] - 0.2 and y[10] > y[6] and y[-1] == 0.0 and not drive.collided
+    return drive
+
+
+@pytest.fixture(params=["cut_in", "aborted", "highway"])
 def drive(request: pytest.FixtureRequest) -> Drive:
     found: Drive = request.getfixturevalue(request.param)
     return found

@@ -21,7 +21,7 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     (("list", "--loud"), ("--loud", "See rare-envs list --help.")),
     (("list", "egoss"), ("did you mean 'egos'", "environments, methods, egos")),
     (("bases", "merge"), ("merge", "cut_in")),
-    (("bases", "cutting"), ("did you mean 'cut_in'?",)),
+    (("bases", "cut_inn"), ("did you mean 'cut_in'?",)),
     (("estimate",), ("Expected an environment",)),
     ((*ESTIMATE, "--ego"), ("--ego", "See rare-envs estimate --help.")),
     ((*ESTIMATE, "--max-sim", "ten"), ("'--max-sim'", "such as 10000 or 1e4", "See rare-envs estimate")),
