@@ -37,7 +37,11 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         return outcomes[0]
     trace = tuple(replace(level, run=i) for i, outcome in enumerate(outcomes) for level in outcome.trace)
     if outcomes[0].parts:
-        return sum_strata(_combine_parts(outcomes, confidence), confidence, trace)
+        same = [list(parts) for parts in zip(*(outcome.parts for outcome in outcomes), strict=True)]
+        wholes = [replace(combine([part.outcome for part in parts], confidence), trace=()) for parts in same]
+        counts_of = [sum(part.n_sim for part in parts) for parts in same]
+        added = zip(outcomes[0].parts, wholes, counts_of, strict=True)
+        return sum_strata([replace(part, outcome=whole, n_sim=n) for part, whole, n in added], confidence, trace)
     counts = pool_counts(outcomes)
     used = outcomes if counts else [each for each in outcomes if each.status is not Status.STOPPED] or outcomes
     shares = [each.counts[1] / counts[1] if counts and each.counts else 1 / len(used) for each in used]
@@ -192,15 +196,9 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
         Medicine 27, 2008.
     """
     p = sum(part.share * part.p for part in parts)
-    samples = [part.outcome.sample for part in parts]
-    parts = tuple(
-        replace(
-            part,
-            of_sum=part.share * part.p / p if p > 0 else math.nan,
-            n_units=0 if sample is None else sample.n_units,
-        )
-        for part, sample in zip(parts, samples, strict=True)
-    )
+    n_units = [0 if part.outcome.sample is None else part.outcome.sample.n_units for part in parts]
+    of_sum = [part.share * part.p / p if p > 0 else math.nan for part in parts]
+    parts = tuple(map(lambda part, of, n: replace(part, of_sum=of, n_units=n), parts, of_sum, n_units))
     found, present = [part for part in parts if part.p > 0], {part.outcome.status for part in parts}
     below = math.hypot(*(part.share * (part.p - part.interval[0]) for part in parts))
     above = math.hypot(*(part.share * (part.interval[1] - part.p) for part in parts))
@@ -248,19 +246,6 @@ def dilute(found: Outcome, nothing: Outcome, share: float) -> Outcome:
         base_draws=found.base_draws + nothing.base_draws,
         draw_weights=tuple(replace(each, log_share=each.log_share + math.log(share)) for each in found.draw_weights),
     )
-
-
-def _combine_parts(outcomes: Sequence[Outcome], confidence: float) -> list[Part]:
-    """Return the parts of sums over the same strata, each of all runs together."""
-    same = [list(parts) for parts in zip(*(outcome.parts for outcome in outcomes), strict=True)]
-    return [
-        replace(
-            parts[0],
-            n_sim=sum(part.n_sim for part in parts),
-            outcome=replace(combine([part.outcome for part in parts], confidence), trace=()),
-        )
-        for parts in same
-    ]
 
 
 def _add_samples(parts: Sequence[Part]) -> Sample | None:

@@ -1,9 +1,9 @@
 """Sums over strata: p = sum_k w_k p_k, the simulations where the error of the sum is.
 
 Every stratum has runs of its own under its own base distribution. First come pilots, a quarter of the simulations in
-equal parts. The rest goes to the strata half by Neyman's rule, in proportion to w_k times the standard deviation of
-p_k for one simulation, and half in proportion to w_k times the width of its interval, which a stratum without a failure
-has too. One whose part of the rest is no larger than its pilot keeps the pilot; any other has a new run, and p_k is
+equal parts. The rest goes to the strata by Neyman's rule, in proportion to w_k times the width of the interval of p_k
+for one simulation: that is its standard deviation where failures were met, and what may be there where none was. One
+whose part of the rest is no larger than its pilot keeps the pilot; any other has a new run, and p_k is
 that of the new run alone, so that the pilot decides how large the run is and adds nothing to it: unbiased. Counts of
 plain draws are pooled with those of the pilot, which makes p too low by less than a tenth of its standard error
 (`benchmarks/samplers/strata.py`).
@@ -120,11 +120,6 @@ class _Sum:
         self.trace = list[Level]()
         self.n_sim, self.stopped, self.at_limit = 0, False, set[int]()
 
-    @property
-    def left(self) -> int:
-        """Simulations left."""
-        return self.goal.budget - self.n_sim
-
     def steps(self) -> Steps:
         """Make rounds of runs until there is nothing to add."""
         tasks, rounds = self._plan_pilots(), 0
@@ -151,37 +146,32 @@ class _Sum:
 
     def _plan_more(self) -> list[Task]:
         """Return the runs to make beside those made."""
-        target, whole = self.goal.target_cov, sum_strata(self.parts, self.goal.confidence, ())
-        if target is None or whole.p == 0:
-            if self.goal.max_sim is None or self.left < 1:
-                return []
-            return [Task(i, int(n), target) for i, n in enumerate(self._allocate(np.full(len(self.parts), True))) if n]
-        if whole.cov <= target:
+        target, whole, k = self.goal.target_cov, sum_strata(self.parts, self.goal.confidence, ()), len(self.parts)
+        use, targets = np.full(k, True), [target] * k
+        if target is not None and whole.p > 0:
+            limits = [target / math.sqrt(part.of_sum) if part.p > 0 else math.inf for part in whole.parts]
+            missed = [part.cov > limit for part, limit in zip(whole.parts, limits, strict=True)]
+            use = np.array([late and i not in self.at_limit for i, late in enumerate(missed)]) & (whole.cov > target)
+            targets = [MARGIN * limit for limit in limits]
+        elif self.goal.max_sim is None:
             return []
-        limits = [target / math.sqrt(part.of_sum) if part.p > 0 else math.inf for part in whole.parts]
-        missed = [part.cov > limit for part, limit in zip(whole.parts, limits, strict=True)]
-        wanted = np.array([late and i not in self.at_limit for i, late in enumerate(missed)])
-        if self.goal.max_sim is None:
-            return [Task(int(i), None, MARGIN * limits[i]) for i in np.flatnonzero(wanted)]
-        sizes = self._allocate(wanted)
-        return [Task(i, int(n), MARGIN * limits[i]) for i, n in enumerate(sizes) if n]
+        sizes = [None] * k if self.goal.max_sim is None else [int(n) for n in self._allocate(use)]
+        return [Task(i, sizes[i], targets[i]) for i in range(k) if use[i] and sizes[i] != 0]
 
-    def _allocate(self, use: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def _allocate(self, use: NDArray[np.bool_]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
-        root = np.array([part.share for part in self.parts]) * np.sqrt(np.maximum(self.behind, 1.0)) * use
-        deviation = root * [part.p * part.cov if part.p > 0 else 0.0 for part in self.parts]
-        width = root * [part.interval[1] - part.interval[0] for part in self.parts]
-        found = deviation if deviation.any() else width
-        need = found / max(found.sum(), 1e-300) + width / max(width.sum(), 1e-300)
-        pools = np.array([part.outcome.counts is not None for part in self.parts])
+        widths = [part.share * (part.interval[1] - part.interval[0]) for part in self.parts]
+        need = np.sqrt(np.maximum(self.behind, 1.0)) * widths
+        pools = [part.outcome.counts is not None for part in self.parts]
         least = np.where(pools, 0.0, self.behind)  # a new run takes the place of the one before: a smaller one is worse
+        sizes = np.zeros(len(self.parts))
         while use.any():
-            sizes = np.floor(self.left * need * use / (need * use).sum())
+            sizes = np.floor((self.goal.budget - self.n_sim) * need * use / (need * use).sum())
             gain = np.where(use, sizes - least, math.inf)
             if gain.min() > 0:
-                return np.asarray(sizes, dtype=np.int64)
-            use = use & (np.arange(len(use)) != np.argmin(gain))
-        return np.zeros(len(self.parts), dtype=np.int64)
+                break
+            use, sizes = use & (np.arange(len(use)) != np.argmin(gain)), 0 * sizes
+        return sizes
 
     def _run(self, task: Task) -> Generator[FloatArray, FloatArray, None]:
         """Make a run in a stratum; where its method does not stop at a target, as many as that takes."""

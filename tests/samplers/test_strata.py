@@ -116,6 +116,7 @@ def test_the_sum_is_exact(method, max_sim):
         assert part.interval[0] < norm.sf(AT[part.name]) < part.interval[1]
 
 
+@pytest.mark.slow
 def test_the_surrogate_adds_up():
     result = samplers.estimate(even(at=(3.0, 2.0)), "surrogate", seed=1, max_sim=300)
     assert result.interval[0] < exact((0.7, 0.3), (3.0, 2.0)) < result.interval[1] and result.n_sim <= 300
@@ -142,10 +143,10 @@ def test_the_ends_are_those_of_zou_and_donner():
 def test_unbiased_and_covered_with_few_simulations():
     """100 plain draws for two strata: intervals of shares of draws hold p 95 times in 100 or more."""
     shares, at = (0.7, 0.3), (2.0, 0.5)
-    p, results = exact(shares, at), [samplers.estimate(even(shares, at), "mc", seed=s, max_sim=100) for s in range(300)]
+    p, results = exact(shares, at), [samplers.estimate(even(shares, at), "mc", seed=s, max_sim=100) for s in range(150)]
     found = np.array([result.p for result in results])
-    assert abs(found.mean() - p) < 3.3 * found.std() / 300**0.5 + 0.1 * found.std()  # pooled pilots
-    assert sum(r.interval[0] <= p <= r.interval[1] for r in results) >= 275  # 95 %, by chance lower in 1 of 700
+    assert abs(found.mean() - p) < 3.3 * found.std() / 150**0.5 + 0.1 * found.std()  # pooled pilots
+    assert sum(r.interval[0] <= p <= r.interval[1] for r in results) >= 134  # 95 %, by chance lower in 1 of 700
     assert found.std() < 0.95 * math.sqrt(p * (1 - p) / 100)  # worth more than 100 draws of the whole
 
 
