@@ -66,7 +66,7 @@ class Scenario:
         >>> cut_in = scenario_named("cut_in")
         >>> cut_in.vehicle_names, cut_in.labels
         (('ego', 'cutter', 'lead'), ('the ego', 'the cutter', 'the lead'))
-        >>> state = cut_in.initial(torch.tensor([[20.0, 15.0, 25.0, 10.0, 50.0, 3.5]]))
+        >>> state = cut_in.initial(torch.tensor([[20.0, 15.0, 25.0, 10.0, 50.0, 3.5, 4.0, *[0.0] * 6]]))
         >>> cut_in.others(state, 0.1).x.round(decimals=1).tolist()  # cutter and lead one tick later
         [[16.5, 72.5]]
     """
@@ -240,7 +240,7 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
 
     Example:
         >>> from rare_envs.scenarios import scenario_named
-        >>> load_base(scenario_named("hard_brake"), "us101").dim
+        >>> load_base(scenario_named("car_following"), "us101").dim
         3
     """
     base = scenario.default_base if base is None else base
@@ -351,9 +351,13 @@ def try_scenario(scenario: Scenario) -> None:
         theta = getattr(after, "theta", None)
         if theta is not None and (not isinstance(theta, Tensor) or theta.shape != state.theta.shape):
             raise ValueError(f"{wrong}expected {what} to keep the shape {tuple(state.theta.shape)} of theta.")
+    for name, shape in (("signals", (_DRAWS, n - 1)), ("evades", (_DRAWS,))):
+        tell: Callable[[State], Tensor] | None = getattr(scenario, name)
+        if tell is not None and (told := tell(state)).shape != shape:
+            raise ValueError(f"{wrong}expected {name}(state) of shape {shape}, got {tuple(told.shape)}.")
 
 
-def _check(wrong: str, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
+def _check(wrong: str, what: str, fields: tuple[Any, ...], vehicles: int) -> None:
     """Check that fields are tensors (B, vehicles) of finite numbers."""
     if not isinstance(fields, tuple) or len(fields) < 4 or not all(isinstance(field, Tensor) for field in fields[:4]):
         raise ValueError(f"{wrong}expected {what} to give x, y, heading and speed, as State or Others; got {fields!r}.")

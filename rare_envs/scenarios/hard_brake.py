@@ -6,6 +6,7 @@ stands. Recorded brakings are parabolas instead: over 268 of NGSIM's US 101 the 
 thirds of the recorded way.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,7 +72,7 @@ HARD_BRAKE = Scenario(
         Parameter("peak", "m/s^2", 0.5, 10.0, "largest deceleration of the lead, in the middle of its braking"),
         Parameter("loss", "m/s", 1.0, 50.0, "speed that the lead loses; from its speed on it comes to a standstill"),
     ),
-    bases=provisional_bases("hard_brake", ("us101",), BetaDistribution([1.0], [1.0], [1.0], [50.0])),
+    bases=provisional_bases("hard_brake", ("us101",), BetaDistribution(*np.array([[1.0], [1.0], [1.0], [50.0]]))),
     initial=initial,
     others=others,
     driven=keep_lane,

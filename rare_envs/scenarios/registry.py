@@ -123,12 +123,11 @@ def complete_id(env_id: str) -> str:
     Namespace and version may be left out, and words be joined in any way: "cut_in", "CutIn" and "cut-in-v1" are
     "rare_envs/CutIn-v1". Without a version it is the newest; names in several namespaces need theirs.
     """
-    if not isinstance(env_id, str):  # is refused where the scenario is looked for
+    if isinstance(env_id, str):  # what is no id is refused where the scenario is looked for
+        env_id = env_id.removeprefix("rare_envs:")
+    if str(env_id) in SCENARIOS or is_highway_env_id(env_id):
         return env_id
-    env_id = env_id.removeprefix("rare_envs:")
-    if env_id in SCENARIOS or is_highway_env_id(env_id):
-        return env_id
-    namespace, name, version = _spell(env_id)
+    namespace, name, version = _spell(str(env_id))
     found: dict[str, tuple[int, str]] = {}  # the newest by namespace
     for each in (each for known in SCENARIOS for each in (known, kinematics_id(known))):
         own, its_name, its_version = _spell(each)

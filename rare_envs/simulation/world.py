@@ -441,8 +441,8 @@ def rule_based_actions(episode: Episode) -> Tensor:
 
 def _choose(which: Tensor, one: Others, other: Others) -> Others:
     """Return one where `which` is set, boolean, shape (B, N - 1), and the other elsewhere, with its memory."""
-    chosen = (torch.where(which, a, b) for a, b in zip(one[:4], other[:4], strict=True))
-    return Others(*chosen, theta=getattr(other, "theta", None))
+    x, y, heading, speed = (torch.where(which, a, b) for a, b in zip(one[:4], other[:4], strict=True))
+    return Others(x, y, heading, speed, getattr(other, "theta", None))
 
 
 class Driver(Protocol):

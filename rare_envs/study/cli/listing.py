@@ -21,7 +21,14 @@ from rare_envs.measures.base import Measure, TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
-from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS, SCENARIOS, env_id_of, find_scenario, kinematics_id
+from rare_envs.scenarios.registry import (
+    HIGHWAY_ENV_IDS,
+    SCENARIOS,
+    complete_id,
+    env_id_of,
+    find_scenario,
+    kinematics_id,
+)
 from rare_envs.sensors.camera import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
 from rare_envs.study.arguments import BadInput
@@ -124,15 +131,15 @@ def print_overview(entries: dict[str, Any]) -> None:
 
 def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
     """Return the part of the names that a kind, an environment id or its part behind the slash means."""
-    known = {name: name for name in KINDS}
-    known |= {part: name for name in entries["environments"] for part in (name, name.partition("/")[2])}
-    if what not in known:
-        kinds = ", ".join(KINDS)
-        raise BadInput(f"Expected {kinds} or an environment, got {what!r}{did_you_mean(what, known)}.")
+    env_id = complete_id(what)
+    if what not in KINDS and env_id not in entries["environments"]:
+        names = [part for name in entries["environments"] for part in (name, name.partition("/")[2])]
+        hint = did_you_mean(what, [*KINDS, *names])
+        raise BadInput(f"Expected {', '.join(KINDS)} or an environment, got {what!r}{hint}.")
     if what == EVERYTHING:
         return entries
     if what not in KINDS:
-        return {"environments": {known[what]: entries["environments"][known[what]]}}
+        return {"environments": {env_id: entries["environments"][env_id]}}
     return {kind: entries[kind] for kind in (("environments", "highway_env") if what == "environments" else (what,))}
 
 

@@ -116,6 +116,7 @@ def without_a_value(function: Callable[..., Any], field: str) -> Callable[..., A
         ({"others": lambda state, dt: None}, r"expected others\(state, dt\) to give x, y, .* or Others; got None\.$"),
         ({"others": lambda state, dt: Others(1, 2, 3, 4)}, r"heading and speed, as State or Others; got Others\(x=1"),
         ({"others": lambda state, dt: Others(*others(state, dt)[:4], state.theta[:3])}, r"to keep the shape \(8, 0\)"),
+        ({"signals": lambda state: state.x > 0.0}, r"expected signals\(state\) of shape \(8, 1\), got \(8, 2\)\.$"),
         ({"others": without_a_value(others, "y")}, r"y from others\(state, dt\) is not finite\.$"),
         ({"driven": lambda state, action, dt: Others(*state[:4])}, r"x of shape \(B, 1\) from driven.*, got \(8, 2\)"),
     ],
