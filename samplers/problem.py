@@ -127,6 +127,10 @@ class Distribution(Protocol):
     One some of whose coordinates are the simulation's own randomness, independent and standard normal, has their mask
     `noise`, shape (d,): `TwoStage` does not search among them, it draws them as they come.
 
+    A mixture of populations that fail in other ways has `strata`, a tuple of objects with `name`, `share` and `base`, a
+    distribution over the same columns with a density of 0 in the other strata; shares add up to 1. p is then estimated
+    as the sum of share times p of each (`Estimate.parts`), however rare one is.
+
     Example:
         Half-normal in each coordinate: x = Phi^-1((1 + Phi(u)) / 2).
 

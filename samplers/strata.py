@@ -5,11 +5,12 @@ equal parts. The rest goes to the strata by Neyman's rule, in proportion to w_k 
 for one simulation: that is its standard deviation where failures were met, and what may be there where none was. One
 whose part of the rest is no larger than its pilot keeps the pilot; any other has a new run, and p_k is
 that of the new run alone, so that the pilot decides how large the run is and adds nothing to it: unbiased. Counts of
-plain draws are pooled with those of the pilot, which makes p too low by less than a tenth of its standard error
+plain draws are pooled with those of the pilot, which makes p too low by about a tenth of its standard error
 (`benchmarks/samplers/strata.py`).
 
 With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in strata whose own c.o.v. is above
-t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t.
+t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum without a failure goes on, as far as
+max_sim allows, while it may add more than is known: w_k h_k > p, with h_k the upper end of its p_k.
 
 References:
     Neyman, "On the two different aspects of the representative method", Journal of the Royal Statistical Society 97,
@@ -149,10 +150,11 @@ class _Sum:
         target, whole, k = self.goal.target_cov, sum_strata(self.parts, self.goal.confidence, ()), len(self.parts)
         use, targets = np.full(k, True), [target] * k
         if target is not None and whole.p > 0:
-            limits = [target / math.sqrt(part.of_sum) if part.p > 0 else math.inf for part in whole.parts]
-            missed = [part.cov > limit for part, limit in zip(whole.parts, limits, strict=True)]
-            use = np.array([late and i not in self.at_limit for i, late in enumerate(missed)]) & (whole.cov > target)
-            targets = [MARGIN * limit for limit in limits]
+            for i, part in enumerate(whole.parts):
+                targets[i] = MARGIN * (limit := target / math.sqrt(part.of_sum or 1.0))
+                late = part.cov > limit and whole.cov > target
+                may_add_most = part.share * part.interval[1] > whole.p
+                use[i] = i not in self.at_limit and (late if part.p > 0 else may_add_most)
         elif self.goal.max_sim is None:
             return []
         sizes = [None] * k if self.goal.max_sim is None else [int(n) for n in self._allocate(use)]

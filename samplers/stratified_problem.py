@@ -143,9 +143,10 @@ class PaddedBase(DrawnByItsMap):
         return np.split(x, [1, 1 + self.size], axis=1)
 
     def log_prob(self, x: FloatArray) -> FloatArray:
-        """Return the log density (n,) at x (n, d), all rows in this stratum."""
-        _, own, rest = self._split(x)
-        return np.asarray(self.own.log_prob(own) - 0.5 * (rest**2 + LOG_TWO_PI).sum(axis=1))
+        """Return the log density (n,) at x (n, d); -inf in other strata."""
+        first, own, rest = self._split(x)
+        log_p = self.own.log_prob(own) - 0.5 * (rest**2 + LOG_TWO_PI).sum(axis=1)
+        return np.where(np.floor(first[:, 0]) == self.number, log_p, -np.inf)
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map x (n, d) to u ~ N(0, I)."""

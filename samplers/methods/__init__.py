@@ -47,7 +47,8 @@ class Auto(Method):
        a target c.o.v. without max_sim goes to `TwoStage`.
 
     The budget is that of one replicate. The result is that of the method chosen, to the bit, and names it;
-    `Estimate.choice` says which and why, and so does the result's text where it is not `TwoStage`.
+    `Estimate.choice` says which and why, and so does the result's text where it is not `TwoStage`. In a sum over strata
+    every run of a stratum chooses for itself, by its own budget (`Part.method` is the last choice).
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.

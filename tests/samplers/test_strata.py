@@ -254,6 +254,13 @@ def test_the_target_is_met_and_nothing_spent_on_what_does_not_matter(method, max
             assert result.parts[0].n_sim < 5000  # one run
 
 
+def test_a_stratum_that_may_add_most_is_looked_at_before_the_target_counts_as_met():
+    """A pilot of 125 draws misses p = 1e-3 in 0.99 of x; what the other stratum has, 0.01 times 0.16, is soon known."""
+    for seed in range(5):
+        result = samplers.estimate(even((0.99, 0.01), (3.09, 1.0)), "mc", seed=seed, max_sim=20_000, target_cov=0.2)
+        assert result.parts[0].p > 0 and result.parts[0].n_sim > 2000
+
+
 def test_a_target_that_cannot_be_met_is_told():
     result = samplers.estimate(even(), "mc", seed=0, max_sim=300, target_cov=0.001)
     assert result.status is Status.BUDGET and any("was not met" in text for text in result.remarks)
