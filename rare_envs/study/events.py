@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 import samplers
 from rare_envs.exposure import (
@@ -138,26 +139,43 @@ def list_strata(base: Any) -> tuple[Any, ...]:
     return found if len(found) > 1 else ()
 
 
-def stratum_of(strata: Sequence[Any], x: FloatArray) -> FloatArray:
+def stratum_of(strata: Sequence[Any], x: FloatArray) -> NDArray[np.intp]:
     """Return the number of the stratum of each point x (n, d), shape (n,)."""
-    found: FloatArray = np.argmax([np.log(each.share) + each.base.log_prob(x) for each in strata], axis=0)
+    found: NDArray[np.intp] = np.argmax([np.log(each.share) + each.base.log_prob(x) for each in strata], axis=0)
     return found
 
 
 def split_by_stratum(estimate: samplers.Estimate, base: Any) -> tuple[PartValue, ...]:
     """Return share times p of each stratum of a base distribution, from the estimate of the sum."""
-    strata, found = list_strata(base), []
+    strata = list_strata(base)
     if not strata:
         return ()
-    failures = analysis.weigh_failures(estimate)
-    which = stratum_of(strata, failures.x) if len(failures.x) else np.empty(0)
-    for number, part in enumerate(estimate.parts):
-        low, high = part.interval
-        value, cov, uncertainty = part.share * part.p, part.cov, None
-        here = (which == number).astype(np.float64)
-        if here.any():
-            own = analysis.expect_over_failures(failures, here, estimate.confidence)
-            uncertainty = analysis.expect_under_refits(estimate, failures, here, own)
-        ends = (part.share * low, part.share * high)
-        found.append(PartValue(name=part.name, share=part.share, value=value, cov=cov, interval=ends, base=uncertainty))
-    return tuple(found)
+    try:
+        failures = analysis.weigh_failures(estimate)
+    except ValueError:  # nothing failed, or p is no sum over points
+        uncertainties: list[BaseUncertainty | None] = [None] * len(strata)
+    else:
+        which = stratum_of(strata, failures.x)
+        uncertainties = [_find_base_error(estimate, failures, which == k) for k in range(len(strata))]
+    return tuple(
+        PartValue(
+            name=part.name,
+            share=part.share,
+            value=part.share * part.p,
+            cov=part.cov,
+            interval=(part.share * part.interval[0], part.share * part.interval[1]),
+            base=uncertainty,
+        )
+        for part, uncertainty in zip(estimate.parts, uncertainties, strict=True)
+    )
+
+
+def _find_base_error(
+    estimate: samplers.Estimate, failures: analysis.WeightedFailures, here: NDArray[np.bool_]
+) -> BaseUncertainty | None:
+    """Return what the events behind the base leave open of the part of p at some of the failing points."""
+    if not here.any():
+        return None
+    h = here.astype(np.float64)
+    own = analysis.expect_over_failures(failures, h, estimate.confidence)
+    return analysis.expect_under_refits(estimate, failures, h, own)

@@ -63,3 +63,32 @@ def write_fitted(path: Path, scenario: str, **changes: Any) -> str:
     """Write `fitted_entries` and return the name of the file."""
     path.write_text(json.dumps(fitted_entries(scenario, **changes)))
     return str(path)
+
+
+def write_stratified(path: Path, spread: float = 0.3) -> str:
+    """Write a base of brakings of two kinds, with refits that have shares of their own; return the name of the file."""
+    entries = fitted_entries("hard_brake", spread=spread)
+    shape = {key: entries.pop(key) for key in ("weights", "covariances", "means")}
+    box = {"low": entries.pop("low"), "high": entries.pop("high"), "coordinates": ["plain"] * 4}
+    means, refits = shape["means"][0], entries.pop("refits")
+    kinds = {
+        "slowing": (0.8, 21.0, [["loss", "speed", -150.0, -1.0]]),
+        "stop": (0.2, 40.0, [["loss", "speed", 0.0, 150.0]]),
+    }
+
+    def place(loss: float, means: list[float]) -> dict[str, Any]:
+        return {**shape, "means": [[*means[:3], loss]]}
+
+    strata = [
+        {"name": name, "share": share, **box, "within": within, **place(loss, means)}
+        for name, (share, loss, within) in kinds.items()
+    ]
+    rng = np.random.default_rng(1)
+    own = []
+    for refit in refits:
+        stop = 0.2 * float(np.exp(0.2 * rng.standard_normal()))
+        shares = {"slowing": 1.0 - stop, "stop": stop}
+        own.append({"strata": [{"share": shares[k], **place(kinds[k][1], refit["means"][0])} for k in kinds]})
+    told = {"strata": strata, "limits": [-0.5], "column": 3, "less": 0}
+    path.write_text(json.dumps({**entries, **told, "refits": own}))
+    return str(path)

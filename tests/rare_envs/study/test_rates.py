@@ -25,7 +25,7 @@ from rare_envs.study.events import EventRate, split_by_stratum, sum_people
 from rare_envs.study.report import describe_left_out, find_frequency
 from rare_envs.study.risk import choose_base, compare_sites
 from rare_envs.study.text import describe_model, format_rate, format_with_interval, tabulate_events
-from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
+from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
 
 FEW = {"method": "mc", "max_sim": 400}
 OTHER_SITE = {"source": {"site": "another", "data": "more"}}
@@ -237,6 +237,37 @@ def test_each_event_stands_beside_people_in_it() -> None:
     lines = tabulate_events([replace(events[0], parts={"looked": 0.08, "unseen": 0.92}), *events[1:]])
     assert "0.31 (0.0079 to 1.7)" in lines[1] and lines[2] == "  of which unseen 92 %, looked 8 %"
     assert "4.0 (2.2 to 6.9)" in lines[3] and "uncalibrated" not in lines[3]
+
+
+def test_brakings_of_two_kinds_are_two_events(tmp_path: Path, bases: dict[str, str]) -> None:
+    """The rate of each is frequency x share x its p; together they are that of all brakings, beside 13 + 0 contacts."""
+    both = {**bases, "hard_brake": write_stratified(tmp_path / "brakings.json")}
+    found = rare_envs.risk("idm", scenarios=("hard_brake",), bases={"hard_brake": both["hard_brake"]}, **FEW)
+    report = found.scenarios[0].report
+    parts, events = {part.name: part for part in report.estimate.parts}, {each.event: each for each in found.events}
+    assert list(events) == ["slowing", "stop"]
+    for name, share in (("slowing", 0.8), ("stop", 0.2)):
+        rate = events[name].rate
+        assert rate.per_million_km == pytest.approx(1e6 * 42 / 218 * share * parts[name].p)
+        low, high = rate.interval_per_million_km
+        assert low < rate.per_million_km < high
+        counts = math.exp(1.96 / 42**0.5)  # more than those of the count and of the simulations alone
+        assert high / rate.per_million_km > max(counts, parts[name].interval[1] / parts[name].p)
+    assert sum(each.rate.per_million_km for each in found.events) == pytest.approx(found.total.per_million_km)
+    assert found.people.count == 13
+    assert [each["event"] for each in found.to_dict()["events"]] == ["slowing", "stop"]
+    lines = str(found).splitlines()
+    assert lines[0].endswith("; people in the same events 4.0 (2.2 to 6.9)") and lines[2].startswith(
+        "  slowings of the"
+    )
+
+
+def test_a_part_without_a_failure_has_an_upper_end(tmp_path: Path) -> None:
+    base = write_stratified(tmp_path / "brakings.json")
+    report = run(prepare(question(base, max_sim=400, horizon=0.8)))
+    assert report.estimate.p == 0 and {each.rate.determined for each in report.events} == {False}
+    for each in report.events:
+        assert each.rate.interval_per_million_km[1] > each.share * 1e6 * 42 / 218 * 3 / 400  # the rule of three
 
 
 def test_a_rate_is_uncalibrated_where_the_model_misses_people_by_more_than_a_factor_of_three() -> None:
