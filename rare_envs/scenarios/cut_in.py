@@ -197,7 +197,7 @@ class CutterModel:
     until it notices the ego, and then turns back at once. The lead keeps its speed, or brakes once in a parabola.
 
     Measured against recorded cutters from the same states (root mean square error of the mean acceleration over 2 s):
-    0.68 m/s^2 on US 101 and 0.53 on I-80, where `CutIn-v0`'s script has 1.31 and 0.94.
+    0.69 m/s^2 on US 101 and 0.53 on I-80, where `CutIn-v0`'s script has 1.31 and 0.94.
 
     References:
         Kesting, Treiber and Helbing, "Enhanced intelligent driver model", 2010, the heuristic.

@@ -20,23 +20,23 @@ I24 = ("i24_cut_ins.csv",)
 STATE = ["v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead"]
 
 
-def read_us101() -> pd.DataFrame:
-    """Starts on US 101, and the speed of the follower in the mean of 0.6 s around 2 s later."""
-    events, keys = pd.read_csv(DATA / US101[0]), ["scene", "ego", "epoch_ms"]
+def read_us101(who: str = "ego") -> pd.DataFrame:
+    """Starts on US 101, and the speed of the follower, or the cutter, in the mean of 0.6 s around 2 s later."""
+    events, keys = pd.read_csv(DATA / US101[0]), ["scene", who, "epoch_ms"]
     events = events[(events.phase == "start") & events.ego.notna() & events["lead"].notna()]
     rows = pd.read_parquet(DATA / US101[1], columns=["scene", "vehicle", "epoch_ms", "speed"])
-    both = events[keys].merge(rows, left_on=["scene", "ego"], right_on=["scene", "vehicle"], suffixes=("", "_later"))
+    both = events[keys].merge(rows, left_on=["scene", who], right_on=["scene", "vehicle"], suffixes=("", "_later"))
     both = both[(both.epoch_ms_later - both.epoch_ms - 1000 * LATER).abs() <= 300]
     return events.merge(both.groupby(keys).speed.mean().rename("later").reset_index(), on=keys)
 
 
-def read_i80() -> pd.DataFrame:
-    """Starts on I-80, and the speed of the follower 20 pictures later."""
+def read_i80(who: str = "ego") -> pd.DataFrame:
+    """Starts on I-80, and the speed of the follower, or the cutter, 20 pictures later."""
     events = pd.read_csv(DATA / I80[0])
     events = events[events.settled & (events.phase == "start") & (events["lead"] > 0) & (events.ego > 0)]
     rows = pd.read_parquet(DATA / I80[1], columns=["vehicle", "frame", "speed"])
-    rows = rows.rename(columns={"vehicle": "ego", "speed": "later"}).assign(frame=rows.frame - round(10 * LATER))
-    return events.merge(rows, on=["ego", "frame"])
+    rows = rows.rename(columns={"vehicle": who, "speed": "later"}).assign(frame=rows.frame - round(10 * LATER))
+    return events.merge(rows, on=[who, "frame"])
 
 
 def read_i24() -> pd.DataFrame:
