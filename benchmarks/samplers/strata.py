@@ -132,7 +132,8 @@ def main(
         numbers = f"{row['error']:.3f}  {row['own']:.3f}  {row['whole']:.2f}  {row['n_sim']:.0f}  {row['seconds']:.2f}"
         head = f"{case.method:10} {case.max_sim or 'none':>7}  {row['coverage']:.3f}"
         print(f"{head}     {row['below']:5}  {row['above']:5}  {bias}  {numbers}", flush=True)
-    about = {"repetitions": repetitions, "cases": to_json_value(rows)}
+    command = f"python -m benchmarks.samplers.strata --repetitions {repetitions}"
+    about = {"command": command, "repetitions": repetitions, "cases": to_json_value(rows)}
     out.write_text(json.dumps(about, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
