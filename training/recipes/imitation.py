@@ -128,7 +128,7 @@ class EncounterSpec(NamedTuple):
 ENCOUNTERS = (
     EncounterSpec("rare_envs/CutIn-v0", "us101-15-offsets", 20, 4.0),
     EncounterSpec("rare_envs/CutIn-v0", "highway", 10, 4.0),
-    EncounterSpec("hard_brake", "us101-all-brakings", 8, 8.0),
+    EncounterSpec("hard_brake", "us101", 8, 8.0),
     EncounterSpec("car_following", "us101-gap", 2, 8.0),
     EncounterSpec("car_following", "highway", 2, 8.0),
     EncounterSpec("straight", None, 10, 30.0),

@@ -118,9 +118,10 @@ def _draw_cut_in(n: int, rng: np.random.Generator) -> Array:
 
 
 def _draw_hard_brake(n: int, rng: np.random.Generator) -> Array:
-    """Draw columns of the hard brake, shape (n, 3): headways of 0.8 to 3 s, decelerations of 0.5 to 6 m/s^2."""
+    """Draw columns of the hard brake, shape (n, 4): headways of 0.8 to 3 s, peaks of 0.5 to 6 m/s^2, half to a stop."""
     own = rng.uniform(3.0, TOP_SPEED, n)
-    return np.column_stack((own, 3.0 + own * rng.uniform(0.8, 3.0, n), rng.uniform(0.5, 6.0, n)))
+    gap, peak = 3.0 + own * rng.uniform(0.8, 3.0, n), rng.uniform(0.5, 6.0, n)
+    return np.column_stack((own, gap, peak, np.maximum(own * rng.uniform(0.2, 1.8, n), 1.0)))
 
 
 def make_situations() -> tuple[Situation, ...]:
