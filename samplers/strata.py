@@ -22,7 +22,7 @@ References:
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,22 +47,6 @@ SHARE_ROUNDING = 1e-6
 """Shares add up to 1 within this."""
 
 
-class BaseStratum(Protocol):
-    """A stratum of a base distribution, one of its `strata`: the base is the mixture of theirs by share."""
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-
-    @property
-    def share(self) -> float:
-        """Its probability w_k; those of all strata add up to 1."""
-
-    @property
-    def base(self) -> Distribution:
-        """Distribution of X in it, over the same columns; supports of strata do not overlap."""
-
-
 def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
     """Raise a ValueError unless strata have different names and shares above 0 that add up to 1."""
     if len(set(names)) < len(names) or not all(isinstance(name, str) and name for name in names):
@@ -72,8 +56,12 @@ def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
         raise ValueError(f"Expected shares of strata above 0 that add up to 1, got {given} = {math.fsum(shares):.6g}.")
 
 
-def read_strata(base: Any) -> tuple[BaseStratum, ...]:
-    """Return the strata of a base distribution, none where it has fewer than two; a ValueError if they do not fit."""
+def read_strata(base: Any) -> tuple[Any, ...]:
+    """Return the strata of a base distribution (see `samplers.Distribution`), none where it has fewer than two.
+
+    Raises:
+        ValueError: If names, shares or bases do not fit.
+    """
     strata = tuple(getattr(base, "strata", None) or ())  # a base distribution need not have it
     check_shares([stratum.name for stratum in strata], [stratum.share for stratum in strata] or [1.0])
     for stratum in strata:
@@ -87,7 +75,7 @@ class SumOfStrata:
     """A method for one density as one for sums over strata."""
 
     method: Stepping
-    strata: tuple[BaseStratum, ...]
+    strata: tuple[Any, ...]
 
     name: ClassVar[str] = "strata"
     stops_at_target: ClassVar[bool] = True
@@ -97,12 +85,8 @@ class SumOfStrata:
         return _Sum(self, inputs, goal, rng).steps()
 
 
-class Task(NamedTuple):
-    """A run to be made in a stratum."""
-
-    stratum: int
-    max_sim: int | None
-    target_cov: float | None
+Task = tuple[int, int | None, float | None]
+"""A run to be made: the number of its stratum, its max_sim and its target_cov."""
 
 
 class _Sum:
@@ -127,7 +111,7 @@ class _Sum:
         while tasks:
             for task in tasks:
                 if not self.stopped:
-                    yield from self._run(task)
+                    yield from self._run(*task)
             rounds += 1
             more = not self.stopped and rounds <= (1 if self.goal.target_cov is None else MOST_ROUNDS)
             tasks = self._plan_more() if more else []
@@ -138,12 +122,12 @@ class _Sum:
         k, n, target = len(self.parts), self.goal.max_sim, self.goal.target_cov
         target = max(target, PILOT_COV) if target is not None and self.method.stops_at_target else None
         if n is None:
-            return [Task(i, None, target) for i in range(k)]
+            return [(i, None, target) for i in range(k)]
         few = n < FEWEST * k
         sizes = np.full(k, n // k if few else int(PILOT_SHARE * n) // k)
         if few:
             sizes[np.argsort([-part.share for part in self.parts], kind="stable")[: n % k]] += 1
-        return [Task(i, int(size), target) for i, size in enumerate(sizes) if size]
+        return [(i, int(size), target) for i, size in enumerate(sizes) if size]
 
     def _plan_more(self) -> list[Task]:
         """Return the runs to make beside those made."""
@@ -158,7 +142,7 @@ class _Sum:
         elif self.goal.max_sim is None:
             return []
         sizes = [None] * k if self.goal.max_sim is None else [int(n) for n in self._allocate(use)]
-        return [Task(i, sizes[i], targets[i]) for i in range(k) if use[i] and sizes[i] != 0]
+        return [(i, sizes[i], targets[i]) for i in range(k) if use[i] and sizes[i] != 0]
 
     def _allocate(self, use: NDArray[np.bool_]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
@@ -175,21 +159,23 @@ class _Sum:
             use, sizes = use & (np.arange(len(use)) != np.argmin(gain)), 0 * sizes
         return sizes
 
-    def _run(self, task: Task) -> Generator[FloatArray, FloatArray, None]:
+    def _run(
+        self, stratum: int, max_sim: int | None, target_cov: float | None
+    ) -> Generator[FloatArray, FloatArray, None]:
         """Make a run in a stratum; where its method does not stop at a target, as many as that takes."""
-        stratum, part, n_before = self.strata[task.stratum], self.parts[task.stratum], self.n_sim
-        inputs = InputsOnly(self.inputs.dim, stratum.base, offer_of(self.inputs))
+        part, n_before = self.parts[stratum], self.n_sim
+        inputs = InputsOnly(self.inputs.dim, self.strata[stratum].base, offer_of(self.inputs))
         others = sum(each.share * each.p for each in self.parts if each is not part)
 
         def tell_level(level: Level) -> None:
             estimate = others + part.share * level.estimate
-            self.goal.on_level(replace(level, stratum=stratum.name, estimate=estimate))
+            self.goal.on_level(replace(level, stratum=part.name, estimate=estimate))
 
-        goal = replace(self.goal, max_sim=task.max_sim, target_cov=task.target_cov, on_level=tell_level)
+        goal = replace(self.goal, max_sim=max_sim, target_cov=target_cov, on_level=tell_level)
         method, runs, outcomes = choose_method(self.method, inputs, goal).method, list[Replicate](), list[Outcome]()
         while not self.stopped and (not runs or needs_another(runs, method, goal, 1)):
             first = self.n_sim
-            left = None if task.max_sim is None else task.max_sim - (first - n_before)
+            left = None if max_sim is None else max_sim - (first - n_before)
             own = replace(goal, max_sim=left)
             run = Replicate(method.steps(inputs, own, self.rng.spawn(1)[0]), own, inputs)
             runs.append(run)
@@ -202,15 +188,15 @@ class _Sum:
                 else:
                     run.resume(answer)
             self.n_sim += run.n_sim
-            self.trace += [replace(level, stratum=stratum.name) for level in run.outcome.trace]
+            self.trace += [replace(level, stratum=part.name) for level in run.outcome.trace]
             weights = tuple(replace(each, first=first + each.first) for each in run.outcome.draw_weights)
             outcomes.append(replace(run.outcome, trace=(), draw_weights=weights))
         found, n = combine(outcomes, goal.confidence), self.n_sim - n_before
-        if task.max_sim is None and task.target_cov is not None and found.cov > task.target_cov:
-            self.at_limit.add(task.stratum)
-        whole, self.behind[task.stratum] = self._join(part, self.behind[task.stratum], found, n)
+        if max_sim is None and target_cov is not None and found.cov > target_cov:
+            self.at_limit.add(stratum)
+        whole, self.behind[stratum] = self._join(part, self.behind[stratum], found, n)
         whole = replace(whole, draw_weights=tuple(replace(each, run=0) for each in whole.draw_weights))
-        self.parts[task.stratum] = replace(part, outcome=whole, n_sim=part.n_sim + n, method=method.name)
+        self.parts[stratum] = replace(part, outcome=whole, n_sim=part.n_sim + n, method=method.name)
 
     def _join(self, part: Part, n_old: float, found: Outcome, n: float) -> tuple[Outcome, float]:
         """Return the outcome of a stratum after a further run, and the simulations behind it."""

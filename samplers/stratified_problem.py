@@ -40,7 +40,7 @@ class Stratum:
     name: str
     """What it is called."""
     share: float
-    """Probability of the stratum, or how often it comes per unit of the whole: w_k."""
+    """Probability of the stratum, w_k."""
     problem: Problem
     """f_k and the distribution of X_k, of any number of dimensions."""
     log_sd: float | None = None
