@@ -13,6 +13,7 @@ from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT, CUT_IN, CUT_IN_V1, CUTTER_IDM, CutterModel
 from rare_envs.simulation import World, drive
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import rollout
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic_states import F64, tensor
 
@@ -130,6 +131,16 @@ def test_whoever_looks_never_moves_into_a_body_beside_it(looks: bool) -> None:
         into += int((after.collided & ~before.collided & flank & falling & (taken > 6)).sum())
         before = after
     assert into == 0 if looks else into > 100
+
+
+def test_the_later_it_is_noticed_the_more_often_they_touch() -> None:
+    """Noticed 0.1, 0.5 and 1.5 s after the body is over the line, and never."""
+    x, touched = draws(2000), []
+    x[:, NAMES.index("attention")] = ATTENTION_LIMIT - 1.0
+    for noticing in (0.0, np.log(5.0) / 0.3, np.log(15.0) / 0.3, -3.0):
+        x[:, NAMES.index("noticing")] = noticing
+        touched.append(int(rollout(World(CUT_IN_V1), Coasting(), x).collided.sum()))
+    assert touched == sorted(touched) and touched[-1] > 1.2 * touched[0] > 0
 
 
 def test_a_lead_brakes_once_in_a_parabola() -> None:

@@ -28,10 +28,12 @@ from rare_envs.study.plots import (
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
 
-CUT_IN = "rare_envs/CutIn-v0"
+CUT_IN, NEWEST = "rare_envs/CutIn-v0", "rare_envs/CutIn-v1"
 
 
-@pytest.mark.parametrize(("env_id", "core"), [*((each, "torch") for each in rare_envs.ENV_IDS), (CUT_IN, "numba")])
+@pytest.mark.parametrize(
+    ("env_id", "core"), [*((each, "torch") for each in rare_envs.ENV_IDS), (CUT_IN, "numba"), (NEWEST, "numba")]
+)
 def test_a_replay_gives_the_same_f_bit_for_bit_or_to_rounding_of_a_compiled_rollout(env_id: str, core: str) -> None:
     problem = rare_envs.DrivingProblem(env_id, core=core)
     learned = problem.world.background is not None  # whose products round differently by batch size
