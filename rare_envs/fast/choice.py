@@ -97,7 +97,8 @@ def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np
 def find_script(world: World, statistics: bool = False) -> Script:
     """Return the compiled script of a world, with statistics of its episodes or not; else NotCompiled."""
     scenario, measurement = world.scenario, world.measurement
-    script = getattr(scenario.others, "__func__", scenario.others)  # of a method
+    cutter = getattr(scenario.others, "__self__", CUTTER)  # of a method; a class of a user's may decide otherwise
+    script = getattr(scenario.others, "__func__", scenario.others) if type(cutter) is CutterModel else None
     known = [(name, vehicles) for others, name, vehicles in SCRIPTS if script is others]
     names = [name for name, vehicles in known if scenario.vehicles == vehicles]
     _refuse(
@@ -114,7 +115,7 @@ def find_script(world: World, statistics: bool = False) -> Script:
             "parameters of the weather are": world.dim != scenario.size,
         }
     )
-    return Script(names[0], getattr(scenario.others, "__self__", CUTTER))
+    return Script(names[0], cutter)
 
 
 def read_ego(world: World, driver: Driver) -> IDM | DensePolicy:

@@ -114,7 +114,8 @@ def is_recordable(world: World, driver: Driver) -> bool:
     drivers = (driver,) if world.background is None else (driver, world.background)
     scenario = world.scenario
     scripts = (scenario.initial, scenario.others, scenario.driven, scenario.signals, scenario.evades)
-    own = (script is None or str(getattr(script, "__module__", "")).startswith("rare_envs.") for script in scripts)
+    owners = (type(script.__self__) for script in scripts if hasattr(script, "__self__"))  # of methods
+    own = (str(getattr(each, "__module__", "")).startswith("rare_envs.") for each in (*scripts, *owners) if each)
     measure = world.measurement.episode_measure
     read = (measure.measure, measure.order) if isinstance(measure, TermTracker) else (measure,)
     known = (PAIR_CLEARANCE, *MEASURES.values())

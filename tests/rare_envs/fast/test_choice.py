@@ -13,6 +13,7 @@ import rare_envs
 from rare_envs import IDM
 from rare_envs.fast import rollouts
 from rare_envs.scenarios import car_following
+from rare_envs.scenarios.cut_in import CutterModel
 from rare_envs.simulation.world import Measurement
 from rare_envs.traffic.state import State
 
@@ -81,6 +82,26 @@ def test_a_scenario_that_places_the_vehicles_otherwise_is_compiled_and_a_script_
     assert (compiled.core, compiled.evaluate(X)) == ("numba", pytest.approx(31.0 / 5.0))
     own.world = replace(own.world, scenario=replace(scenario, others=lambda state, dt: scenario.others(state, dt)))
     assert (own.core, own.evaluate(X)) == ("torch", pytest.approx(6.0))
+
+
+def test_a_cutter_with_other_numbers_is_compiled_and_one_of_ones_own_class_is_not() -> None:
+    class Bolder(CutterModel):
+        """May decide otherwise."""
+
+    compiled, reference = (rare_envs.DrivingProblem("rare_envs/CutIn-v1", core=core) for core in ("numba", "torch"))
+    x = compiled.base.sample(300, np.random.default_rng(0))
+    x[:, 3] -= 12.0  # beside the ego and close in front of it
+    x = x[x[:, 3] > -10.0]
+    usual = reference.evaluate(x)
+    for problem in (compiled, reference):
+        hasty = CutterModel(reaction_time=0.2, most_braking=0.5, coolness=0.5, margin=3.0).scenario()
+        problem.world = replace(problem.world, scenario=hasty)
+    assert (compiled.core, reference.core) == ("numba", "torch")
+    expected = reference.evaluate(x)
+    assert compiled.evaluate(x) == pytest.approx(expected, abs=1e-4) and (np.abs(expected - usual) > 0.1).any()
+    own = rare_envs.DrivingProblem("rare_envs/CutIn-v1")
+    own.world = replace(own.world, scenario=Bolder().scenario())
+    assert own.core == "torch"
 
 
 @pytest.mark.parametrize("env_id", [CAR_FOLLOWING, "rare_envs/HardBrake-v0"])

@@ -12,7 +12,7 @@ from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.policy import as_driver
 from rare_envs.measures import MEASURES, Measure, Moment
 from rare_envs.measures.registry import PAIR_CLEARANCE, TermTracker
-from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_V1
+from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_V1, CutterModel
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation import cuda_graphs
 from rare_envs.simulation.cuda_graphs import RecordedRollouts, is_recordable
@@ -74,6 +74,7 @@ def test_what_a_user_made_of_a_driver_or_a_scenario_is_not_recorded() -> None:
 
     assert not is_recordable(World(CUT_IN), Hesitant())
     assert not is_recordable(World(replace(CUT_IN, initial=lambda x: CUT_IN.initial(x))), IDM())
+    assert not is_recordable(World(type("Bolder", (CutterModel,), {"__module__": "mine"})().scenario()), IDM())
     assert not is_recordable(World(replace(CUT_IN_V1, signals=lambda state: state.x[:, 1:] > 0.0)), IDM())
     behind = replace(as_driver(agents.load_ego("noisy:idm"), World(CUT_IN)), inner=Hesitant())
     assert not is_recordable(World(CUT_IN), behind)
