@@ -55,6 +55,9 @@ from rare_envs.simulation.terms import (
 from rare_envs.simulation.world import Driver, Measurement, World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
+COMPILED_DRAWS = 300_000
+"""Compiled rollouts of some seconds; without a failure among them p is below 1e-5."""
+
 
 class DrivingProblem:
     """P[f(X) <= gamma] for an ego in a scenario; fits `samplers.Problem`.
@@ -189,6 +192,11 @@ class DrivingProblem:
         that both cores are asked the same questions, and give the same answers but for rounding.
         """
         return not is_compiled(self.world, self.driver)
+
+    @property
+    def plain_draws(self) -> int:
+        """Rollouts that are made of a stratum in which nothing failed, for its upper end: a matter of seconds."""
+        return COMPILED_DRAWS if is_compiled(self.world, self.driver) else 0
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -355,6 +355,7 @@ class Evaluator:
         self.problem, self._journal, self._executor = problem, journal, executor
         self.dim, self.base = int(problem.dim), problem.base
         self.given, self.column_names = str(getattr(problem, "given", "")), names_of_columns(problem)
+        self.plain_draws = int(getattr(problem, "plain_draws", 0))
         self._gamma, self._work = gamma, Work(problem, gamma, on_error, name, None if executor is None else seed)
         self._split = find_chunk_size(problem, size)
         self._size = None if size is None and executor is None else self._split

@@ -208,7 +208,8 @@ class Run:
         strata = read_strata(problem.base)
         goal = replace(self._goal, max_sim=shares[0])  # the smallest share
         self._choice = Choice(method) if strata else choose_method(method, self._inputs, goal)
-        self._method = SumOfStrata(method, strata) if strata else self._choice.method
+        plain_draws = int(getattr(problem, "plain_draws", 0))  # a problem need not have it
+        self._method = SumOfStrata(method, strata, plain_draws) if strata else self._choice.method
         self.progress, self._listener = Progress(n_sim=0, max_sim=self._goal.max_sim), listener
         self._n_sim = self._n_errors = 0
         self._failures = Failures.empty(self._inputs.dim)

@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 
 from samplers.combination import combine, dilute, pool_counts, sum_strata
 from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, choose_method, offer_of
+from samplers.plain_draws import PlainDraws
 from samplers.problem import Distribution, FloatArray, Inputs
 from samplers.replicate import NOT_KNOWN, InputsOnly, Replicate, needs_another
-from samplers.sample import Level, Status
+from samplers.sample import Level, Status, zero_hit_bound
 
 PILOT_SHARE = 0.25
 """Share of max_sim for the pilots."""
@@ -43,6 +44,10 @@ MARGIN = 0.9
 """Part of a target c.o.v. that a stratum is given: the sum's own p is not yet known."""
 MOST_ROUNDS = 6
 """Rounds of runs for a target, pilots aside."""
+PLENTY = 6000
+"""Simulations for a stratum in which nothing fails; further ones are plain draws, which all count in its upper end."""
+LEAST_GAIN = 0.1
+"""Plain draws are made where they are more than this part of the simulations made."""
 SHARE_ROUNDING = 1e-6
 """Shares add up to 1 within this."""
 
@@ -76,6 +81,8 @@ class SumOfStrata:
 
     method: Stepping
     strata: tuple[Any, ...]
+    plain_draws: int = 0
+    """Plain draws that are made beyond the method's own simulations where nothing fails and there is no max_sim."""
 
     name: ClassVar[str] = "strata"
     stops_at_target: ClassVar[bool] = True
@@ -94,6 +101,7 @@ class _Sum:
 
     def __init__(self, method: SumOfStrata, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> None:
         self.method, self.strata, self.inputs, self.goal, self.rng = method.method, method.strata, inputs, goal, rng
+        self.plain_draws = method.plain_draws
         nothing = replace(
             NOT_KNOWN,
             status=Status.BUDGET,
@@ -115,6 +123,9 @@ class _Sum:
             rounds += 1
             more = not self.stopped and rounds <= (1 if self.goal.target_cov is None else MOST_ROUNDS)
             tasks = self._plan_more() if more else []
+        for stratum, n in self._plan_plain_draws():
+            if not self.stopped:
+                yield from self._run(stratum, n, None, PlainDraws())
         return sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
 
     def _plan_pilots(self) -> list[Task]:
@@ -142,7 +153,18 @@ class _Sum:
         elif self.goal.max_sim is None:
             return []
         sizes = [None] * k if self.goal.max_sim is None else [int(n) for n in self._allocate(use)]
+        for i, size in enumerate(sizes):
+            if size is not None and self.parts[i].p == 0:
+                sizes[i] = min(size, PLENTY)
         return [(i, sizes[i], targets[i]) for i in range(k) if use[i] and sizes[i] != 0]
+
+    def _plan_plain_draws(self) -> list[tuple[int, int]]:
+        """Return the strata in which nothing failed, each with its part of the simulations left for plain draws."""
+        n = self.plain_draws if self.goal.max_sim is None else self.goal.max_sim - self.n_sim
+        empty = [i for i, part in enumerate(self.parts) if part.p == 0 and part.n_sim]
+        whole = sum(self.parts[i].share for i in empty)
+        drawn = [(i, int(n * self.parts[i].share / whole)) for i in empty]
+        return [(i, size) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
 
     def _allocate(self, use: NDArray[np.bool_]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
@@ -160,7 +182,7 @@ class _Sum:
         return sizes
 
     def _run(
-        self, stratum: int, max_sim: int | None, target_cov: float | None
+        self, stratum: int, max_sim: int | None, target_cov: float | None, method: Stepping | None = None
     ) -> Generator[FloatArray, FloatArray, None]:
         """Make a run in a stratum; where its method does not stop at a target, as many as that takes."""
         part, n_before = self.parts[stratum], self.n_sim
@@ -172,7 +194,8 @@ class _Sum:
             self.goal.on_level(replace(level, stratum=part.name, estimate=estimate))
 
         goal = replace(self.goal, max_sim=max_sim, target_cov=target_cov, on_level=tell_level)
-        method, runs, outcomes = choose_method(self.method, inputs, goal).method, list[Replicate](), list[Outcome]()
+        method = method or choose_method(self.method, inputs, goal).method
+        runs, outcomes = list[Replicate](), list[Outcome]()
         while not self.stopped and (not runs or needs_another(runs, method, goal, 1)):
             first = self.n_sim
             left = None if max_sim is None else max_sim - (first - n_before)
@@ -212,6 +235,8 @@ class _Sum:
             about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
             return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
+        if found.p == 0 == old.p:
+            return replace(found, interval=(0.0, zero_hit_bound(drawn, self.goal.confidence)), base_draws=drawn), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost
             return dilute(old, found, n_old / (n_old + n)), n_old + n
         return replace(found, base_draws=drawn), n

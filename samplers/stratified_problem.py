@@ -90,6 +90,7 @@ class StratifiedProblem:
         self.base = StratifiedBase(self.strata, tuple(float(each.share) for each in self.strata))
         self.dim = self.base.dim
         problems = [each.problem for each in self.strata]
+        self.plain_draws = min(int(getattr(problem, "plain_draws", 0)) for problem in problems)
         self.chunk_size = min(find_chunk_size(problem) for problem in problems)
         self.given = "; ".join(dict.fromkeys(given for each in problems if (given := getattr(each, "given", ""))))
         own = {names for each in problems if len(names := names_of_columns(each)) == self.dim - 1}

@@ -466,3 +466,17 @@ def test_the_base_fits_together():
 def test_errors_say_what_is_wrong(make, text):
     with pytest.raises(ValueError, match=text):
         make()
+
+
+def test_where_nothing_fails_further_simulations_are_plain_draws() -> None:
+    """Of n draws without a failure the upper end is 1 - .05^(1/n): all count, as those of a search do not."""
+    safe = FunctionProblem(lambda x: np.ones(len(x)), dim=2)
+    failing = FunctionProblem(lambda x: 1.0 - x[:, 0], dim=1)  # Phi(-1) = .159
+    problem = StratifiedProblem([Stratum("safe", 0.9, safe), Stratum("failing", 0.1, failing)])
+    problem.plain_draws = 50_000
+    nothing, found = samplers.estimate(problem, seed=0).parts
+    assert nothing.n_sim >= 50_000 and found.n_sim < 7000
+    assert nothing.interval[0] == 0 < nothing.interval[1] <= 1 - 0.05 ** (1 / 50_000)
+    limited = samplers.estimate(problem, seed=0, max_sim=40_000)
+    assert limited.n_sim <= 40_000 and limited.parts[0].interval[1] < 3.0 / 5000
+    assert limited.interval[0] < 0.1 * 0.1587 < limited.interval[1]

@@ -7,7 +7,7 @@ import numpy as np
 import samplers
 from samplers.method import Goal
 from samplers.methods import monte_carlo as kept_draws
-from samplers.methods.monte_carlo import KeptDraws
+from samplers.plain_draws import KeptDraws
 
 
 def test_draws_from_the_base_itself():
