@@ -7,6 +7,7 @@ GPU takes for all of them, at 1,024 rollouts.
 from __future__ import annotations
 
 import threading
+from types import MethodType
 from typing import Any, NamedTuple
 
 import torch
@@ -114,7 +115,7 @@ def is_recordable(world: World, driver: Driver) -> bool:
     drivers = (driver,) if world.background is None else (driver, world.background)
     scenario = world.scenario
     scripts = (scenario.initial, scenario.others, scenario.driven, scenario.signals, scenario.evades)
-    owners = (type(script.__self__) for script in scripts if hasattr(script, "__self__"))  # of methods
+    owners = [type(script.__self__) for script in scripts if isinstance(script, MethodType)]
     own = (str(getattr(each, "__module__", "")).startswith("rare_envs.") for each in (*scripts, *owners) if each)
     measure = world.measurement.episode_measure
     read = (measure.measure, measure.order) if isinstance(measure, TermTracker) else (measure,)
