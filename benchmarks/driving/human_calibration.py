@@ -39,7 +39,7 @@ from rare_envs.egos.human import HUMAN_EGOS, HumanEgo
 from rare_envs.exposure import MILLION_KM, Event, EventCalibration, ModelCount, Outcome, people_in
 from rare_envs.measures.registry import NearCrash, NearCrashState
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.cut_in import UNSEEN_SHARE, CutterModel
+from rare_envs.scenarios.cut_in import CutterModel
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from samplers.sample import clopper_pearson
 
@@ -276,7 +276,7 @@ def find_events(site: str) -> dict[Event, tuple[float, dict[str, float]]]:
                 found.setdefault(event, (frequency.per_km, {}))[1][each.name] = each.share
             else:  # each stratum is an event of its own
                 found[event] = (frequency.per_km * each.share, {each.name: 1.0})
-    return found
+    return {event: found[event] for event in EVENT_WORDS if event in found}
 
 
 def calibrate(cells: Sequence[CalibrationCell], site: str) -> dict[Event, EventCalibration]:
@@ -368,7 +368,7 @@ def describe_factor(factor: float) -> str:
     """Return a factor from people's interval in words."""
     if factor == 1.0:
         return "inside people's interval"
-    return f"{factor:.2g} times its upper end" if factor > 1.0 else f"{1.0 / factor:.2g} times below its lower end"
+    return f"{factor:.1f} times its upper end" if factor > 1.0 else f"{1.0 / factor:.1f} times below its lower end"
 
 
 def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCell], site: str) -> list[str]:
@@ -395,11 +395,11 @@ def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCe
     )
     km, near = rare_envs.exposure.UNSEEN_CHANGES_100CAR, unseen.near_crashes / unseen.draws
     share = km.per_million_km / MILLION_KM / cut_ins.per_km / near if near > 0 else math.nan
+    shares = find_events(site)["cut_in"][1]
     told.append(
         f"The share of cutters who had not looked that gives people's 44 near-crashes in own changes: {share:.1e} "
-        f"(the scenario has {UNSEEN_SHARE:.1e}): what cutters who had not looked add to near-crashes is calibrated."
+        f"(the base has {shares['unseen']:.1e}): what they add to near-crashes is calibrated, not predicted."
     )
-    shares = find_events(site)["cut_in"][1]
     scale = people_in("cut_in").near_crashes.miles * rare_envs.exposure.KM_PER_MILE * cut_ins.per_km
     own = sum(shares[name] * of[name].counter / of[name].draws for name in shares)
     theirs = sum(shares[name] * of[name].evaded / of[name].draws for name in shares)
