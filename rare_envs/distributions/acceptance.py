@@ -95,7 +95,7 @@ class AcceptedGaps:
         ... )
         >>> starts = AcceptedGaps(mixture, limit=0.5)
         >>> round(float(np.exp(starts.log_share)), 3)  # of the mixture's starts that are accepted
-        0.913
+        0.961
         >>> starts.from_standard_normal([[0.0, -3.0, 0.0]]).round(1).tolist()  # closes fast, so the gap is long
         [[14.0, 9.5, 33.0]]
     """

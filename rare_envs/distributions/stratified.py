@@ -159,12 +159,12 @@ class StratifiedDistribution:
     @property
     def low(self) -> FloatArray:
         """Lower ends of the box, shape (d,)."""
-        return np.min([box_of(each.base)[0] for each in self.strata], axis=0)
+        return np.asarray(np.min([box_of(each.base)[0] for each in self.strata], axis=0))
 
     @property
     def high(self) -> FloatArray:
         """Upper ends of the box, shape (d,)."""
-        return np.max([box_of(each.base)[1] for each in self.strata], axis=0)
+        return np.asarray(np.max([box_of(each.base)[1] for each in self.strata], axis=0))
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
         """Return the log density, (n, d) -> (n,); -inf outside the strata."""

@@ -246,8 +246,10 @@ def write_events(events: Mapping[str, NDArray[Any]], path: Path | str) -> None:
     csv.write_csv(pa.table(columns), path)
 
 
-def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return speed and gap at the beginning and strongest deceleration of brakings to a standstill (n, 3), and onsets.
+def find_brakings(position: FloatArray, gap: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return speed and gap at the beginning, peak deceleration and loss of speed of brakings (n, 4), and onsets.
+
+    The loss of a braking to a standstill, which ends below `STANDSTILL_SPEED`, is all of the speed.
 
     Position along the road and gap to the leader (NaN where it is not known) are those of one vehicle at consecutive
     ticks (T,) [m]; the onset (n,) is the tick at which a braking begins. Left out are those under way when the track
@@ -263,32 +265,34 @@ def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> tuple[Flo
         edges = np.flatnonzero(np.diff(braking.astype(np.int8))) + 1
         for first, end in edges.reshape(-1, 2).tolist():
             under_way = first == END_TICKS and acceleration[first - 1] < -BRAKING_ONSET
-            stops = speed[end] < STANDSTILL_SPEED and speed[first : end + 1].min() > LEAST_SPEED and not under_way
-            if stops and speed[first] - speed[end] >= MIN_SPEED_LOSS:
-                events.append((speed[first], gap[first], -acceleration[first:end].min()))
+            whole = speed[first : end + 1].min() > LEAST_SPEED and not under_way
+            if whole and speed[first] - speed[end] >= MIN_SPEED_LOSS:
+                loss = speed[first] - (0.0 if speed[end] < STANDSTILL_SPEED else speed[end])
+                events.append((speed[first], gap[first], -acceleration[first:end].min(), loss))
                 onsets.append(first)
-    return np.array(events).reshape(-1, 3), np.array(onsets, dtype=np.int64)
+    return np.array(events).reshape(-1, 4), np.array(onsets, dtype=np.int64)
 
 
 def hard_brake_events(trajectories: Trajectories) -> Events:
-    """Return brakings to a standstill of any vehicle by `MIN_SPEED_LOSS` or more, at their beginning.
+    """Return brakings of any vehicle by `MIN_SPEED_LOSS` or more, at their beginning.
 
     Returns:
-        The columns recording, frame, vehicle, lane, lead, speed, gap and deceleration, each of shape (events,): speed
+        The columns recording, frame, vehicle, lane, lead, speed, gap, peak and loss, each of shape (events,): speed
         [m/s] of smoothed positions, `gap` from bumper to bumper to the vehicle's own leader [m], NaN where none is
-        recorded or a length is not known, the strongest `deceleration` [m/s^2]. Who follows the vehicle does not
-        matter, so its own gap stands for that behind it.
+        recorded or a length is not known, the `peak` of the deceleration [m/s^2] and the `loss` of speed [m/s], all of
+        it in a braking to a standstill. Who follows the vehicle does not matter, so its own gap stands for that behind
+        it.
 
     Example:
         >>> from training.data import synthetic_traffic
-        >>> len(hard_brake_events(synthetic_traffic(seconds=5.0))["speed"])  # nobody stops
+        >>> len(hard_brake_events(synthetic_traffic(seconds=5.0))["speed"])  # nobody brakes
         0
     """
     t = trajectories
     gap = bumper_gaps(t, np.arange(len(t)), np.where(t.leader != NOBODY, t.find_rows(t.leader), -1))
-    rows, events = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
+    rows, events = [np.empty(0, dtype=np.int64)], [np.empty((0, 4))]
     for track in np.split(np.arange(len(t)), t.track_starts()[1:]):
-        found, onsets = find_standstill_brakings(t.x[track], gap[track])
+        found, onsets = find_brakings(t.x[track], gap[track])
         rows.append(track[onsets])
         events.append(found)
     row, values = np.concatenate(rows), np.concatenate(events)
@@ -298,7 +302,7 @@ def hard_brake_events(trajectories: Trajectories) -> Events:
         "vehicle": t.vehicle[row],
         "lane": t.lane[row],
         "lead": t.leader[row],
-        **dict(zip(("speed", "gap", "deceleration"), values.T, strict=True)),
+        **dict(zip(("speed", "gap", "peak", "loss"), values.T, strict=True)),
     }
 
 

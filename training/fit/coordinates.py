@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates
+from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates, Difference
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
@@ -59,6 +59,8 @@ class CoordinateSystem:
     """Kind of the coordinate by parameter; plain where none is given."""
     order: tuple[str, ...] = ()
     """Parameters in the order of the coordinates; that of x if empty."""
+    within: tuple[Difference, ...] = ()
+    """Ranges of differences of parameters."""
 
     def coordinates(self, parameters: Sequence[Parameter]) -> Coordinates:
         """Return the coordinates of these first parameters of the scenario."""
@@ -69,6 +71,7 @@ class CoordinateSystem:
             kinds=tuple(self.kinds.get(name, "plain") for name in names),
             names=names,
             order=tuple(name for name in self.order if name in names),
+            within=self.within,
         )
 
     def combine(self, apart: CoordinateSystem) -> CoordinateSystem:
@@ -103,7 +106,7 @@ COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
     "hard_brake": (
         CoordinateSystem("plain"),
         CoordinateSystem("log gap", {"gap": "log"}),
-        CoordinateSystem("log gap, log deceleration", {"gap": "log", "deceleration": "log"}),
+        CoordinateSystem("log gap, log peak", {"gap": "log", "peak": "log"}),
     ),
 }
 """Coordinate systems that are tried, by scenario."""

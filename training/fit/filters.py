@@ -78,13 +78,13 @@ EVENT_RECIPES = {
         required=("start_seen",),
         where={"phase": "start"},
     ),
-    "hard_brake": EventRecipe("hard_brake_events.csv", ("speed", "gap", "deceleration")),
+    "hard_brake": EventRecipe("hard_brake_events.csv", ("speed", "gap", "peak", "loss")),
 }
 """Recipes by scenario."""
 EVENT_DEFINITIONS = {
     "car_following": "a vehicle in the picture gets a new leader, which it follows for 2 s or more",
     "cut_in": "a vehicle changes into the lane ahead of another, gaps within the ranges of the scenario",
-    "hard_brake": "the vehicle ahead brakes by 3 m/s or more, to less than 1 m/s",
+    "hard_brake": "the vehicle ahead brakes by 3 m/s or more, to a standstill or not",
 }
 """What is counted as an event of a scenario."""
 FILTER_REASONS = {
@@ -95,6 +95,7 @@ FILTER_REASONS = {
     "m/s": "outside the physical range of speeds",
     "m": "outside the physical range: gaps below it are side by side or errors of position and "
     "length, gaps above it no longer concern the ego",
+    "loss": "less than a braking loses, or more speed than there is",
     "m/s^2": "outside the physical range of decelerations",
     "duration is given": "start or end of the lane change was not recorded",
     "duration": "shorter than tyres allow, or so long that the vehicle drifted rather than changed",

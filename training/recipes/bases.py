@@ -36,7 +36,7 @@ from samplers.problem import FloatArray
 from training.data.events import (
     braking_exposure,
     course_durations,
-    find_standstill_brakings,
+    find_brakings,
     time_around_peak,
     time_between_spans,
 )
@@ -184,7 +184,7 @@ def _read_us101_brakings(folder: Path) -> Read:
     positions = [table["y_along"][track] for track in tracks]
     parts, frames = [], []
     for track, position in zip(tracks, positions, strict=True):
-        events, onsets = find_standstill_brakings(position, table["space_headway"][track] - VEHICLE_LENGTH)
+        events, onsets = find_brakings(position, table["space_headway"][track] - VEHICLE_LENGTH)
         parts.append(events)
         frames.append(table["epoch_ms"][track][onsets] // 100)
     recipe = replace(EVENT_RECIPES[BRAKING], cluster=("frame",))  # stop waves brake one vehicle after the other
