@@ -69,6 +69,7 @@ class Coordinates:
         names: Names of the columns of x; needed where a coordinate or the order names one.
         order: Names of the columns in the order of the coordinates; the order of x by default.
         within: Ranges of differences of two columns, see `Difference`; none by default.
+        origins: What is subtracted from each column whose logarithm is its coordinate, d of them; 0 by default.
 
     Raises:
         ValueError: The box is empty, a kind is unknown or names no column, a column in a logarithm or under a root is
@@ -92,10 +93,12 @@ class Coordinates:
     names: tuple[str, ...] = ()
     order: tuple[str, ...] = ()
     within: tuple[Difference, ...] = ()
+    origins: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         freeze_arrays(self, "low", "high")
         object.__setattr__(self, "kinds", tuple(self.kinds) or ("plain",) * self.low.size)
+        object.__setattr__(self, "origins", tuple(self.origins) or (0.0,) * self.low.size)
         for name in ("names", "order"):
             texts = getattr(self, name)  # a field by its name
             if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
@@ -141,7 +144,8 @@ class Coordinates:
                 other = np.ascontiguousarray(x[:, self.names.index(each.earlier)])
                 ends = np.maximum(ends[0], other + each.least), np.minimum(ends[1], other + each.most)
         if self.rises(j):
-            return (np.log(ends[0]), np.log(ends[1])) if self.is_log(j) else ends
+            origin = self.origins[j]
+            return (np.log(ends[0] - origin), np.log(ends[1] - origin)) if self.is_log(j) else ends
         shift, slope = self.line(j, x)
         return (ends[1] - shift) / slope, (ends[0] - shift) / slope
 
@@ -157,21 +161,21 @@ class Coordinates:
         """Return the coordinate of column j of rows x in the box, (n, d) -> (n,), up to rounding in its bounds."""
         column = np.ascontiguousarray(x[:, j])
         if self.rises(j):
-            return np.log(column) if self.is_log(j) else column
+            return np.log(column - self.origins[j]) if self.is_log(j) else column
         shift, slope = self.line(j, x)
         return np.asarray((column - shift) / slope)
 
     def value(self, j: int, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return column j of x, inside the box or not, from y (n,) and rows x whose earlier columns are set."""
         if self.rises(j):
-            return np.exp(y) if self.is_log(j) else y
+            return np.exp(y) + self.origins[j] if self.is_log(j) else y
         shift, slope = self.line(j, x)
         return np.asarray(shift + slope * y)
 
     def log_slope(self, j: int, x: FloatArray) -> FloatArray | float:
         """Return log |dy/dx| of the coordinate of column j alone, (n,) or 0; the other columns are held."""
         if self.rises(j):
-            return -np.log(np.ascontiguousarray(x[:, j])) if self.is_log(j) else 0.0
+            return -np.log(np.ascontiguousarray(x[:, j]) - self.origins[j]) if self.is_log(j) else 0.0
         return np.asarray(-np.log(-self.line(j, x)[1]))
 
     def log_jacobian(self, x: FloatArray) -> FloatArray:
@@ -194,7 +198,13 @@ class Coordinates:
             for kind in self.kinds
         ]
         within = [list(each) for each in self.within]
-        other: dict[str, list[Any]] = {"names": list(self.names), "order": list(self.order), "within": within}
+        origins = list(self.origins) if any(self.origins) else []
+        other: dict[str, list[Any]] = {
+            "names": list(self.names),
+            "order": list(self.order),
+            "within": within,
+            "origins": origins,
+        }
         found: dict[str, Any] = {key: value for key, value in other.items() if value}
         if found or kinds != ["plain"] * self.dim:
             found = {"coordinates": kinds, **found}
@@ -223,7 +233,7 @@ class Coordinates:
         # A scenario may give one name to several columns; names matter only where something refers to a column.
         within = data.get("within") or ()
         named = order or within or any(isinstance(kind, ClosingSpeed) for kind in read)
-        return cls(low, high, read, data.get("names") or () if named else (), order, within)
+        return cls(low, high, read, data.get("names") or () if named else (), order, within, data.get("origins") or ())
 
     def _check_columns(self) -> None:
         """Raise a ValueError unless box, names and order fit d columns."""
@@ -234,6 +244,8 @@ class Coordinates:
         if (self.low >= self.high).any():
             j = int(np.argmax(self.low >= self.high))
             raise ValueError(f"low must be below high, got [{self.low[j]:g}, {self.high[j]:g}] at coordinate {j}.")
+        if len(self.origins) != d:
+            raise ValueError(f"Expected origins of {d} columns, got {self.origins}.")
         if self.names and len(set(self.names)) != d:
             raise ValueError(f"Expected {d} different names, one for each column, got {', '.join(self.names)}.")
         if self.order and sorted(self.order) != sorted(self.names):
@@ -272,7 +284,8 @@ class Coordinates:
                 f'Unknown coordinate {kind!r} of {what}; known are "plain", "log" and '
                 '{"closing_behind": column, "gap": column}.'
             )
-        if kind != "plain" and not self.low[positive] > 0.0:
+        origin = 0.0 if isinstance(kind, ClosingSpeed) else self.origins[j]
+        if kind != "plain" and not self.low[positive] > origin:
             column = self.names[positive] if self.names else "its column"
             raise ValueError(f"The coordinate of {what} needs a positive low of {column}, got {self.low[positive]:g}.")
 

@@ -491,7 +491,7 @@ def _reorder(
         return mixture
     places = [own.columns.index(column) for column in columns]
     order = tuple(names[column] for column in columns)
-    coordinates = Coordinates(own.low, own.high, own.kinds, own.names or names, order, own.within)
+    coordinates = Coordinates(own.low, own.high, own.kinds, own.names or names, order, own.within, own.origins)
     means, covariances = mixture.means[:, places], mixture.covariances[:, places][:, :, places]
     return TruncatedGaussianMixture(mixture.weights, means, covariances, coordinates=coordinates)
 

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from rare_envs.devices import scalars
 from rare_envs.distributions.fitted import FITTED_KEYS, FileDistribution, FittedDistribution, read_distribution
-from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.files import parse_json_object
 from rare_envs.plugins import did_you_mean
@@ -149,15 +148,6 @@ def base_files(prefix: str, *names: str) -> dict[str, Any]:
     """Return the base distributions of these names that come with the package, as files."""
     folder = resources.files("rare_envs") / "data"
     return {name: folder / f"{prefix}_{name.replace('-', '_')}.json" for name in names}
-
-
-def provisional_bases(prefix: str, names: tuple[str, ...], rest: Any) -> dict[str, Any]:
-    """Return shipped distributions of fewer columns with independent ones behind them, until there are fitted ones."""
-    texts = {name: file.read_text(encoding="utf-8") for name, file in base_files(prefix, *names).items()}
-    return {
-        name: ProductDistribution((read_distribution(parse_json_object(text, name)), rest))
-        for name, text in texts.items()
-    }
 
 
 def columns(*values: Tensor) -> Tensor:

@@ -20,9 +20,8 @@ from torch import Tensor
 from rare_envs.control.human_driver import ATTENTIVE_IDM
 from rare_envs.control.idm import COOLNESS, IDM, improved_acceleration
 from rare_envs.devices import scalars
-from rare_envs.distributions.product import NoiseDistribution
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, base_files, columns, provisional_bases
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, base_files, columns
 from rare_envs.scenarios.hard_brake import PARABOLA, lost_share
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.road import straight
@@ -247,7 +246,7 @@ class CutterModel:
         return replace(
             CUT_IN,
             parameters=(*_CUT_IN_PARAMETERS, *_DRIVER_PARAMETERS),
-            bases=provisional_bases("cut_in_v1", ("us101", "i80"), NoiseDistribution(6)),
+            bases=base_files("cut_in_v1", "us101", "i80", "us101-test", "i80-test"),
             initial=self.initial,
             others=self.others,
             driven=self.driven,

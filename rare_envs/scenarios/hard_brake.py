@@ -6,14 +6,12 @@ stands. Recorded brakings are parabolas instead: over 268 of NGSIM's US 101 the 
 thirds of the recorded way.
 """
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rare_envs.devices import scalars
-from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import Others, Scenario, columns, keep_lane, provisional_bases
+from rare_envs.scenarios.base import Others, Scenario, base_files, columns, keep_lane
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -72,7 +70,7 @@ HARD_BRAKE = Scenario(
         Parameter("peak", "m/s^2", 0.5, 10.0, "largest deceleration of the lead, in the middle of its braking"),
         Parameter("loss", "m/s", 1.0, 50.0, "speed that the lead loses; from its speed on it comes to a standstill"),
     ),
-    bases=provisional_bases("hard_brake", ("us101",), BetaDistribution(*np.array([[1.0], [1.0], [1.0], [50.0]]))),
+    bases=base_files("hard_brake", "us101"),
     initial=initial,
     others=others,
     driven=keep_lane,

@@ -253,8 +253,8 @@ def find_brakings(position: FloatArray, gap: FloatArray) -> tuple[FloatArray, ND
 
     Position along the road and gap to the leader (NaN where it is not known) are those of one vehicle at consecutive
     ticks (T,) [m]; the onset (n,) is the tick at which a braking begins. Left out are those under way when the track
-    begins, and those in which the smoothed vehicle runs backwards: there the recorded position is frozen or jumps, and
-    the deceleration is that of the error (7.3 m/s^2 for one on US 101, beside 3.8 of the next).
+    begins or ends, and those in which the smoothed vehicle runs backwards: there the recorded position is frozen or
+    jumps, and the deceleration is that of the error (7.3 m/s^2 for one on US 101, beside 3.8 of the next).
     """
     events, onsets = [], []
     if len(position) >= SHORTEST_TRACK:
@@ -265,9 +265,11 @@ def find_brakings(position: FloatArray, gap: FloatArray) -> tuple[FloatArray, ND
         edges = np.flatnonzero(np.diff(braking.astype(np.int8))) + 1
         for first, end in edges.reshape(-1, 2).tolist():
             under_way = first == END_TICKS and acceleration[first - 1] < -BRAKING_ONSET
-            whole = speed[first : end + 1].min() > LEAST_SPEED and not under_way
+            stops = speed[end] < STANDSTILL_SPEED
+            goes_on = end == len(braking) - END_TICKS and acceleration[end] < -BRAKING_ONSET and not stops
+            whole = speed[first : end + 1].min() > LEAST_SPEED and not under_way and not goes_on
             if whole and speed[first] - speed[end] >= MIN_SPEED_LOSS:
-                loss = speed[first] - (0.0 if speed[end] < STANDSTILL_SPEED else speed[end])
+                loss = speed[first] - (0.0 if stops else speed[end])
                 events.append((speed[first], gap[first], -acceleration[first:end].min(), loss))
                 onsets.append(first)
     return np.array(events).reshape(-1, 4), np.array(onsets, dtype=np.int64)

@@ -66,7 +66,8 @@ class _Pair:
         """Return mean and sd of the closing speed; intercept, slope and sd of the log gap given it."""
         mean, sd = self.centre[0] + p[0] * self.scale[0], self.scale[0] * np.exp(p[1])
         slope = p[3] * self.scale[1] / self.scale[0]
-        return mean, sd, self.centre[1] + p[2] * self.scale[1] - slope * self.centre[0], slope, self.scale[1] * np.exp(p[4])
+        intercept = self.centre[1] + p[2] * self.scale[1] - slope * self.centre[0]
+        return mean, sd, intercept, slope, self.scale[1] * np.exp(p[4])
 
     def log_likelihood(self, p: FloatArray, limit: float) -> float:
         """Return the log likelihood in units of closing speed and log gap."""
@@ -91,7 +92,7 @@ class _Pair:
 
     def _accepted(self, limit: float) -> FloatArray:
         """Return A at the nodes (closing speeds, log gaps)."""
-        return np.exp(log_acceptance(np.exp(self.node), self.dv[:, None], limit))
+        return np.asarray(np.exp(log_acceptance(np.exp(self.node), self.dv[:, None], limit)))
 
     def climb(self, limit: float | None, start: float = np.inf) -> PairFit:
         """Return the likeliest pair, with a given limit or from a start of its own."""
@@ -102,7 +103,8 @@ class _Pair:
         def loss(p: FloatArray) -> float:
             return -self.log_likelihood(p[:5], float(np.exp(p[5])) if limit is None else limit)
 
-        bounds = [(-MOST_SHIFT, MOST_SHIFT), (-MOST_SPREAD, MOST_SPREAD), (-MOST_SHIFT, MOST_SHIFT), (-3.0, 3.0), (-3.0, 1.0)]
+        shift, spread = (-MOST_SHIFT, MOST_SHIFT), (-MOST_SPREAD, MOST_SPREAD)
+        bounds = [shift, spread, shift, (-3.0, 3.0), (-3.0, 1.0)]
         bounds += [(np.log(LEAST_LIMIT), np.log(MOST_LIMIT))] if limit is None else []
         found = minimize(loss, first, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
         mean, sd, intercept, slope, rest = self.moments(found.x[:5])
@@ -178,5 +180,7 @@ def fit_accepted(joint: FloatArray, apart: FloatArray, parameters: tuple[Paramet
         within=(Difference("ego_speed", "cut_in_speed", *ends["cut_in_speed"]),),
     )
     rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[np.float64])
-    mixture = TruncatedGaussianMixture([1.0], rounded(mean)[None], rounded(covariance)[None], coordinates=coordinates)
+    mixture = TruncatedGaussianMixture(
+        np.ones(1), rounded(mean)[None], rounded(covariance)[None], coordinates=coordinates
+    )
     return AcceptedGaps(mixture, float(f"{pair.limit:.4g}"))

@@ -33,7 +33,7 @@ from training.fit.coordinates import (
     held_out_log_prob,
     refit,
 )
-from training.fit.filters import EventSet
+from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import (
     COVARIANCE_FLOOR,
     EM_STARTS,
@@ -92,7 +92,7 @@ def fit_base(
         (60, 2)
     """
     found = scenario_named(scenario)
-    parameters, systems = tuple(found.parameters), COORDINATE_SYSTEMS[found.name]
+    parameters, systems = recorded_parameters(scenario), COORDINATE_SYSTEMS[found.name]
     names = [system.name for system in systems]
     if system not in (None, *names):
         raise ValueError(f"Unknown coordinate system {system!r}; known are {', '.join(names)}.")
@@ -172,7 +172,7 @@ def format_base(scenario: str, content: Mapping[str, Any]) -> str:
     """Return the text of a base file, which `load_base` reads, from the entries of a distribution's `to_dict`."""
     parameters = scenario_named(scenario).parameters
     head = {"names": [p.name for p in parameters], "units": [p.unit for p in parameters]}
-    return json.dumps({**head, **content}, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps({**head, **content, **head}, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def mass_outside(distribution: TruncatedGaussianMixture, seed: int = 0) -> dict[str, Any]:
@@ -208,19 +208,12 @@ DANGEROUS_STATES: dict[str, State] = {
 
 The needed deceleration brings a vehicle to the speed ahead within the gap: (closing speed)^2 / (2 gap).
 """
-BRAKING_STATES: dict[str, State] = {
-    "time headway < 0.5 s": lambda v, deceleration, gap: gap < 0.5 * v,
-    "deceleration > 3 m/s^2": lambda v, deceleration, gap: deceleration > 3.0,
-    "gap < 3 m": lambda v, deceleration, gap: gap < 3.0,
-}
-"""Of the speed of both [m/s], the deceleration ahead [m/s^2] and the gap [m]."""
 CHECKED: dict[str, tuple[dict[str, State], tuple[tuple[str, str, str], ...]]] = {
     "car_following": (DANGEROUS_STATES, (("ego_speed", "lead_speed", "gap"),)),
     "cut_in": (
         DANGEROUS_STATES,
         (("ego_speed", "cut_in_speed", "cut_in_gap"), ("cut_in_speed", "lead_speed", "lead_gap")),
     ),
-    "hard_brake": (BRAKING_STATES, (("speed", "deceleration", "gap"),)),
 }
 """States of each scenario, and the parameters of each pair of vehicles that they are of."""
 

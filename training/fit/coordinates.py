@@ -61,6 +61,8 @@ class CoordinateSystem:
     """Parameters in the order of the coordinates; that of x if empty."""
     within: tuple[Difference, ...] = ()
     """Ranges of differences of parameters."""
+    origins: Mapping[str, float] = field(default_factory=dict)
+    """What is subtracted from a parameter whose logarithm is its coordinate; 0 where nothing is given."""
 
     def coordinates(self, parameters: Sequence[Parameter]) -> Coordinates:
         """Return the coordinates of these first parameters of the scenario."""
@@ -72,6 +74,7 @@ class CoordinateSystem:
             names=names,
             order=tuple(name for name in self.order if name in names),
             within=self.within,
+            origins=tuple(self.origins.get(name, 0.0) for name in names),
         )
 
     def combine(self, apart: CoordinateSystem) -> CoordinateSystem:

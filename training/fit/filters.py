@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from pyarrow import ArrowInvalid, csv
 
 from rare_envs.distributions.fitted import EventCounts
 from rare_envs.distributions.space import Parameter
+from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 
 
@@ -103,6 +104,18 @@ FILTER_REASONS = {
     "lane's centre), or more than one lane apart",
 }
 """Reasons of filters, by kind of filter, unit of the parameter, or its name."""
+
+
+LEAST_ACCEPTED_GAP = 1.0
+"""Least gap behind of a cutter who looked [m]: as that of `CutIn-v0`."""
+
+
+def recorded_parameters(scenario: str, least_gap: float = LEAST_ACCEPTED_GAP) -> tuple[Parameter, ...]:
+    """Return the parameters of a scenario that are recorded: of cut-ins the first seven, with a least gap behind."""
+    found = scenario_named(scenario)
+    if found.name != "cut_in":
+        return tuple(found.parameters)
+    return tuple(replace(p, low=least_gap) if p.name == "cut_in_gap" else p for p in found.parameters[:7])
 
 
 def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:

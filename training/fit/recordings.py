@@ -13,16 +13,21 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.space import Distribution
 from rare_envs.files import replace_text
+from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
+from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.command_line import EventOptions
 from training.data.columns import Gaps
@@ -37,7 +42,24 @@ from training.data.events import (
 from training.data.formats import load_recordings
 from training.data.table import DT, Trajectories
 from training.fit.base import fit_base, format_base
-from training.fit.filters import EVENT_DEFINITIONS, EVENT_RECIPES, filter_events, read_events
+from training.fit.coordinates import MIN_CLUSTERS
+from training.fit.filters import (
+    CLUSTER_FRAMES,
+    EVENT_DEFINITIONS,
+    EVENT_RECIPES,
+    filter_events,
+    read_events,
+    recorded_parameters,
+)
+from training.fit.strata import (
+    NEAR_IF_UNSEEN,
+    Neighbours,
+    check_starts,
+    find_neighbours,
+    fit_cut_in,
+    fit_hard_brake,
+    keep_neighbours,
+)
 
 COMMAND = "rare-envs fit, with --highd or another option of recordings"
 EXTRACTORS = {
@@ -46,6 +68,13 @@ EXTRACTORS = {
     "hard_brake": hard_brake_events,
 }
 """Functions that extract the events of a scenario."""
+CUT_IN, HARD_BRAKE = "cut_in", "hard_brake"
+LEAST_NEIGHBOURS = 500
+"""Neighbours at random times that a recording of whole traffic has in its first minute."""
+TICKS_PER_SECOND, MOTION_TICKS, ANSWER_TICKS = 10, 20, 30
+"""Of neighbours; of the mean accelerations of cutters and followers; of the followers' hardest braking."""
+HARD_BRAKING = 3.4
+"""A deceleration that drivers rarely use [m/s^2]: AASHTO's of stopping sight distances."""
 SECONDS_BETWEEN = 5.0
 """A count is printed when the line before it is this old [s], so that a short fit prints few lines."""
 
@@ -77,7 +106,7 @@ def count_events(scenario: str, events: Events, used: int, traffic: FloatArray) 
 
     Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
     Car-following: pairs that begin while the ego is in the picture already, times the share that the filters keep.
-    Brakings to a standstill: those that are fitted. The traffic is the sum of `observe_traffic`.
+    Brakings: those that are fitted. The traffic is the sum of `observe_traffic`.
     """
     about: dict[str, Any] = {"source": "counted in the recordings themselves"}
     about["definition"] = EVENT_DEFINITIONS[scenario]
@@ -89,6 +118,74 @@ def count_events(scenario: str, events: Events, used: int, traffic: FloatArray) 
     if count == 0 or used == 0:
         return None
     return EventFrequency(count=count, hours=hours, km=km, share=used / count, share_events=count, **about)
+
+
+def observe_neighbours(table: Trajectories) -> tuple[FloatArray, NDArray[Any]]:
+    """Return who would be cut in on at every second, see `find_neighbours`, and the half-minute of each."""
+    rows = np.flatnonzero((table.frame % TICKS_PER_SECOND == 0) & (table.lane > 0))
+    recording = np.unique(table.recording, return_inverse=True)[1].ravel()[rows]
+    half = 0.5 * np.where(np.isnan(table.length[rows]), VEHICLE_LENGTH, table.length[rows])
+    moment = recording * (int(np.ptp(table.frame)) + 1) + table.frame[rows] - table.frame.min()
+    found, own = find_neighbours(
+        moment, table.lane[rows], table.x[rows] - half, table.x[rows] + half, table.speed[rows]
+    )
+    labels = [f"{table.recording[row]} {table.frame[row] // CLUSTER_FRAMES}" for row in rows[own]]
+    return found, np.array(labels)
+
+
+def _choose_neighbours(beside: Sequence[tuple[FloatArray, NDArray[Any]]]) -> Neighbours | Distribution:
+    """Return the neighbours of the recordings, or the shipped base where these do not show the traffic around."""
+    rows, labels = (np.concatenate(each) for each in zip(*beside, strict=True))
+    clusters = np.asarray(np.unique(labels, return_inverse=True)[1].ravel(), dtype=np.int64)
+    own = keep_neighbours(CUT_IN, rows, clusters, NEAR_IF_UNSEEN["us101"])
+    if len(own.rows) >= LEAST_NEIGHBOURS and len(np.unique(own.clusters)) >= MIN_CLUSTERS:
+        return own
+    typer.echo(
+        f"{CUT_IN}: {len(own.rows)} neighbours at random times are too few; who has not looked is as at US 101",
+        err=True,
+    )
+    return load_base(scenario_named(CUT_IN), "us101")
+
+
+def measure_motion(table: Trajectories, events: Events) -> FloatArray:
+    """Return what cutters and followers did after the start of lane changes, one row each, NaN where not recorded.
+
+    Columns: mean accelerations of cutter and of follower over 2 s, and the follower's hardest braking within 3 s
+    [m/s^2], as smoothed.
+    """
+    first, after = table.track_starts(), np.append(table.track_starts()[1:], len(table))
+    tracks = {
+        (table.recording[a], int(table.vehicle[a])): slice(int(a), int(b)) for a, b in zip(first, after, strict=True)
+    }
+    starts = np.flatnonzero(events["phase"] == "start")
+    out = np.full((len(starts), 3), np.nan)
+    for row, i in enumerate(starts):
+        for column, vehicle in enumerate((events["vehicle"][i], events["ego"][i])):
+            track = tracks.get((events["recording"][i], int(vehicle)))
+            if track is None:
+                continue
+            frame = table.frame[track] - events["frame"][i]
+            speed = [table.speed[track][frame == at] for at in (0, MOTION_TICKS)]
+            if all(len(each) == 1 for each in speed):
+                out[row, column] = (speed[1][0] - speed[0][0]) / (MOTION_TICKS * DT)
+            window = table.acceleration[track][(frame >= 0) & (frame <= ANSWER_TICKS)]
+            if column == 1 and len(window) > ANSWER_TICKS:
+                out[row, 2] = -window.min()
+    return out
+
+
+def summarise_motion(rows: FloatArray) -> dict[str, Any]:
+    """Return counts, means and standard deviations of `measure_motion`, and the share of followers who brake hard."""
+    found: dict[str, Any] = {}
+    for name, column in (("cutters", rows[:, 0]), ("followers", rows[:, 1])):
+        known = column[np.isfinite(column)]
+        if len(known) > 1:
+            found[name] = {"events": len(known), "mean_over_2_s": round(float(known.mean()), 3)}
+            found[name]["sd"] = round(float(known.std(ddof=1)), 3)
+    braking = rows[np.isfinite(rows[:, 2]), 2]
+    if len(braking):
+        found["followers_braking_over_3.4"] = f"{int((braking > HARD_BRAKING).sum())} of {len(braking)} within 3 s"
+    return found
 
 
 def fit_own_bases(
@@ -108,12 +205,16 @@ def fit_own_bases(
     chosen, tell = tuple(scenarios or EVENT_RECIPES), _make_teller(progress)
     out.mkdir(parents=True, exist_ok=True)
     names, traffic, parts = set[str](), np.zeros(4), list[dict[str, Events]]()
+    beside, motions = list[tuple[FloatArray, NDArray[Any]]](), list[FloatArray]()
     for table in tables:
         here = sorted({*table.recording.tolist()})
         names.update(here)
         tell(", ".join(here), f"{len(table):,} rows read; looking for events")
         traffic += observe_traffic(table)
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in chosen})
+        if CUT_IN in chosen:
+            beside.append(observe_neighbours(table))
+            motions.append(measure_motion(table, parts[-1][CUT_IN]))
     source = {
         "site": name,
         "data": f"recordings {', '.join(sorted(names))}",
@@ -128,12 +229,19 @@ def fit_own_bases(
     too_few, written = 0, []
     for scenario in chosen:
         path, recipe = out / f"{scenario}_events.csv", EVENT_RECIPES[scenario]
-        events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
+        events = filter_events(read_events(path, recipe), recipe, recorded_parameters(scenario))
         frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
         asked: dict[str, Any] = {"n_refits": n_refits, "seed": seed, "report": partial(tell, scenario)}
         tell(scenario, f"{len(events.joint):,} events; fitting")
         try:
-            base = fit_base(scenario, events, source, COMMAND, frequency=frequency, **asked)
+            if scenario == CUT_IN:
+                check_starts(events)
+                others = _choose_neighbours(beside)
+                base = fit_cut_in(scenario, events, others, source, COMMAND, frequency=frequency, **asked)
+                base = replace(base, record={**base.record, "motion": summarise_motion(np.concatenate(motions))})
+            else:
+                fit = fit_hard_brake if scenario == HARD_BRAKE else fit_base
+                base = fit(scenario, events, source, COMMAND, frequency=frequency, **asked)
         except ValueError as error:
             too_few += 1
             words = f"{path}: {error} No base of {{}} is written"

@@ -6,9 +6,9 @@ near-crashes of 3.219e6 km were lane changes of drivers who had not seen the oth
 
     share = 44 / (3.219e6 km * cut-ins per km * P[near-crash | not looked]).
 
-P was simulated: 0.38 in the traffic of US 101, 0.53 in that of I-80. The logarithm of the share has a standard deviation
-of 0.74: 44 events 0.15, traffic of the study thinner by up to 2.7 log(2.7) / 2, changes per km by a factor of 2
-log(2) / 2, and how soon drivers notice 0.4. A refit draws a share anew.
+P was simulated: 0.38 in the traffic of US 101, 0.53 in that of I-80. The logarithm of the share has a standard
+deviation of 0.74: 44 events 0.15, traffic of the study thinner by up to 2.7 log(2.7) / 2, changes per km by a factor
+of 2 log(2) / 2, and how soon drivers notice 0.4. A refit draws a share anew.
 
 **Brakings.** To a standstill: speed, gap and peak of the deceleration; all of the speed is lost. Others: the loss too,
 which leaves 1 m/s or more. A refit counts the shares of both in the clusters that it has drawn.
@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from rare_envs.distributions.coordinates import Coordinates, Difference
 from rare_envs.distributions.fitted import EventFrequency, FittedDistribution, PredictiveCheck
@@ -32,6 +31,7 @@ from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.distributions.stratified import CutNormals, StratifiedDistribution, Stratum
+from rare_envs.scenarios.cut_in import ATTENTION_LIMIT
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 from training.fit.acceptance import fit_accepted, profile_limit
@@ -45,13 +45,9 @@ from training.fit.coordinates import (
     draw_events,
     fit_system,
 )
-from training.fit.filters import EventSet
+from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import COVARIANCE_FLOOR, append_independent, select_mixture
 
-ATTENTION_LIMIT = float(ndtri(1.4e-4))
-"""As `rare_envs.scenarios.cut_in.ATTENTION_LIMIT`."""
-LEAST_ACCEPTED_GAP = 1.0
-"""Least gap behind of a cutter who looked [m]: as `CutIn-v0`'s."""
 ATTITUDES = 6
 """Columns behind the seven of a start: standard normals, of which attention is the first."""
 UNSEEN_EVENTS, UNSEEN_KM = 44, 3.219e6
@@ -60,9 +56,17 @@ NEAR_IF_UNSEEN = {"us101": 0.38, "i80": 0.53}
 """Share of changes without a look that are near-crashes, simulated with the human driver; US 101's is the usual one."""
 UNSEEN_LOG_SD = math.sqrt(1.0 / UNSEEN_EVENTS + (math.log(2.7) / 2) ** 2 + (math.log(2.0) / 2) ** 2 + 0.4**2)
 """Of the share of those who do not look: see above."""
-UNSEEN_COMPONENTS = 3
-"""Most components of the neighbours; more change shares beside and close by less than sites differ, and fill files."""
-UNSEEN_SYSTEM = CoordinateSystem("plain gap, log lead gap", {"lead_gap": "log", "duration": "log"})
+UNSEEN_COMPONENTS, UNSEEN_STARTS = 3, 2
+"""Most components of the neighbours, and starts of refits: more change shares beside and close by less than sites
+differ, and fill files."""
+UNSEEN_SYSTEM = CoordinateSystem(
+    "log (gap + 12 m), log lead gap",
+    {"cut_in_gap": "log", "lead_gap": "log", "duration": "log"},
+    origins={"cut_in_gap": -12.0},
+)
+"""Gaps begin with two lengths of bodies below 0, about which a mixture of plain gaps spills over; 12 m is assumed."""
+LEAST_STARTS, LEAST_COURSES, LEAST_BRAKINGS = 10, 3, 10
+"""Events that a fit needs; a stratum of fewer brakings is left out."""
 STOP_LOSS_SPREAD = 1e4
 """Standard deviation of the loss of a braking to a standstill [m/s], cut to 1 m/s: uniform there to 1e-6."""
 LEAST_KEPT = 1.0
@@ -92,19 +96,15 @@ CUT_IN_STATES: dict[str, Check] = {
 """Of speed behind, speed ahead [m/s] and gap [m], (n,) each, where the cutter looked."""
 UNSEEN_STATES: dict[str, Check] = {
     "beside": lambda v, ahead, gap: gap < 0.0,
-    "beside or needed deceleration > 4.9 m/s^2": lambda v, ahead, gap: (gap < 0.0) | (needed(v, ahead, gap) > HARD_NEED),
+    "beside or needed deceleration > 4.9 m/s^2": lambda v, ahead, gap: (
+        (gap < 0.0) | (needed(v, ahead, gap) > HARD_NEED)
+    ),
 }
 BRAKING_STATES: dict[str, Check] = {
     "time headway < 0.5 s": lambda speed, gap, peak: gap < 0.5 * speed,
     "gap < 3 m": lambda speed, gap, peak: gap < 3.0,
     "peak > 3 m/s^2": lambda speed, gap, peak: peak > 3.0,
 }
-
-
-def start_parameters(scenario: str, least_gap: float = LEAST_ACCEPTED_GAP) -> tuple[Parameter, ...]:
-    """Return the first seven parameters of `CutIn-v1`, with a least gap behind of their own."""
-    first = tuple(scenario_named(scenario).parameters)[:7]
-    return tuple(replace(p, low=least_gap) if p.name == "cut_in_gap" else p for p in first)
 
 
 def share_unseen(per_km: float, near: float) -> float:
@@ -142,10 +142,11 @@ class Neighbours:
 def find_neighbours(
     moment: NDArray[Any], lane: NDArray[Any], rear: FloatArray, front: FloatArray, speed: FloatArray
 ) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return who would be cut in on if vehicles changed lanes without looking, (n, 5) as `Neighbours.rows`, and whose row.
+    """Return who would be cut in on if vehicles changed lanes without looking, (n, 5), and the rows of these vehicles.
 
-    All are columns of vehicles at moments, (m,): positions along the road [m]. A neighbour is the nearest vehicle in the
-    next lane whose rear is behind the own front; the lead is the one ahead of it.
+    All are columns of vehicles at moments, (m,): positions along the road [m]. Columns of the result are as those of
+    `Neighbours.rows`: the neighbour is the nearest vehicle in the next lane whose rear is behind the own front, the
+    lead the one ahead of it.
     """
     found, rows = [np.empty((0, 5))], [np.empty(0, dtype=np.intp)]
     order = np.argsort(moment, kind="stable")
@@ -165,7 +166,7 @@ def find_neighbours(
 
 def keep_neighbours(scenario: str, rows: FloatArray, clusters: NDArray[np.int64], near: float) -> Neighbours:
     """Return neighbours within the scenario's ranges."""
-    box = start_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)[:5]
+    box = recorded_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)[:5]
     keep = np.logical_and.reduce([(rows[:, j] >= p.low) & (rows[:, j] <= p.high) for j, p in enumerate(box)])
     return Neighbours(rows[keep], clusters[keep], near)
 
@@ -175,7 +176,8 @@ def _fit_unseen(
 ) -> TruncatedGaussianMixture:
     """Return the mixture of neighbours (n, 5), and of the columns apart behind it."""
     joint = UNSEEN_SYSTEM.coordinates(box[:5])
-    components, _ = select_mixture(joint.to_coordinates(events.joint), seed, UNSEEN_COMPONENTS, starts, joint.names)
+    y = joint.to_coordinates(events.joint)
+    components, _ = select_mixture(y, seed, UNSEEN_COMPONENTS, starts, joint.names)
     side = UNSEEN_SYSTEM.coordinates(box[5:])
     alone, _ = select_mixture(side.to_coordinates(apart), seed, 1, None, side.names)
     coordinates = UNSEEN_SYSTEM.coordinates(box)
@@ -192,6 +194,15 @@ def _join_drivers(accepted: Distribution, unseen: Distribution, share: float) ->
         Stratum("looked", 1.0 - float(f"{share:.4g}"), ProductDistribution((accepted, CutNormals(ends, free)))),
     )
     return StratifiedDistribution(strata, np.array([ATTENTION_LIMIT]), column=7)
+
+
+def check_starts(events: EventSet) -> None:
+    """Raise a ValueError unless there are starts of cut-ins, and offsets and durations, enough for a fit."""
+    if len(events.joint) < LEAST_STARTS or len(events.apart) < LEAST_COURSES:
+        raise ValueError(
+            f"{len(events.joint)} starts with gaps and {len(events.apart)} with offset and duration are too few; "
+            f"{LEAST_STARTS} and {LEAST_COURSES} are needed."
+        )
 
 
 def fit_cut_in(
@@ -222,34 +233,33 @@ def fit_cut_in(
     Raises:
         ValueError: The events are too few.
     """
-    box, d = start_parameters(scenario), events.joint.shape[1]
-    if len(events.joint) < 2 * d or len(events.apart) < 3:
-        raise ValueError(f"{len(events.joint)} starts and {len(events.apart)} durations are too few to fit.")
-    wide = start_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)
+    check_starts(events)
+    box = recorded_parameters(scenario)
+    wide = recorded_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)
     own = isinstance(neighbours, Neighbours)
     near = neighbours.near if isinstance(neighbours, Neighbours) else NEAR_IF_UNSEEN["us101"]
     share = share_unseen(frequency.per_km if frequency else 0.26, near)
     taken = () if own else (neighbours, *getattr(neighbours, "refits", ()))
 
-    def fit_both(drawn: EventSet, k: int, w: float, starts: int | None, rng: np.random.Generator) -> Any:
+    def fit_both(drawn: EventSet, k: int, w: float, rng: np.random.Generator) -> Any:
         accepted = fit_accepted(drawn.joint, drawn.apart, box)
         if isinstance(neighbours, Neighbours):
             rows = neighbours.events if k < 0 else draw_events(neighbours.events, rng)
-            unseen: Any = _fit_unseen(rows, drawn.apart, wide, seed, starts)
+            unseen: Any = _fit_unseen(rows, drawn.apart, wide, seed, UNSEEN_STARTS if k >= 0 else None)
         else:
-            unseen = taken[(k + 1) % len(taken)].strata[0].base.blocks[0]  # type: ignore[attr-defined]  # as shipped
+            unseen = taken[(k + 1) % len(taken)].strata[0].base.blocks[0]
         return _join_drivers(accepted, unseen, w)
 
     rng = np.random.default_rng(seed)
     report("fit")
-    fitted = fit_both(events, -1, share, None, rng)
+    fitted = fit_both(events, -1, share, rng)
     refits = []
     wanted = 0 if len(np.unique(events.clusters)) < MIN_CLUSTERS else N_REFITS if n_refits is None else n_refits
     for k in range(wanted):
         report(f"refit {k + 1} of {wanted}")
         drawn = draw_events(events, rng)
         w = min(share * math.exp(UNSEEN_LOG_SD * rng.standard_normal()), 0.5)
-        refits.append(fit_both(drawn, k, w, FOLD_STARTS, rng))
+        refits.append(fit_both(drawn, k, w, rng))
     ego, cutter, _, gap, _ = events.joint.T
     looked, unseen = fitted.strata[1].base.blocks[0], fitted.strata[0].base.blocks[0]
     k = len(unseen.weights)
@@ -285,7 +295,7 @@ def fit_cut_in(
         distribution=fitted,
         refits=tuple(refits),
         events=events.counts,
-        family=f"accepted gaps (b = {looked.limit:g} m/s^2); unseen: {k} component{plural} of neighbours at random times",
+        family=f"accepted gaps (b = {looked.limit:g} m/s^2); unseen: {k} component{plural} of neighbours",
         frequency=frequency,
         checks=checks,
         record=record,
@@ -328,7 +338,7 @@ def _slowing_system(system: CoordinateSystem, speed: Parameter) -> CoordinateSys
     """Return a system of speed, gap and peak with the log loss first, which leaves 1 m/s or more."""
     kept = Difference("speed", "loss", LEAST_KEPT, speed.high)
     kinds = {**system.kinds, "loss": "log"}
-    return CoordinateSystem(f"{system.name}, log loss", kinds, ("loss", "speed", "gap", "peak"), (kept,))  # type: ignore[arg-type]
+    return CoordinateSystem(f"{system.name}, log loss", kinds, ("loss", "speed", "gap", "peak"), (kept,))
 
 
 def fit_hard_brake(
@@ -361,37 +371,46 @@ def fit_hard_brake(
         labels = drawn.clusters
         return EventSet(drawn.joint[stops, :3], labels[stops]), EventSet(drawn.joint[~stops], labels[~stops])
 
-    def fit_all(drawn: EventSet, starts: int | None) -> tuple[Any, list[SystemFit]]:
+    def fit_all(drawn: EventSet, starts: int | None) -> tuple[StratifiedDistribution, dict[str, SystemFit]]:
         stop, slowing = split(drawn)
-        pairs = (stop, systems, parameters[:3]), (slowing, slowing_systems, narrow)
-        best = [
-            min((fit_system(some, each, box, seed, starts) for each in own), key=lambda fit: fit.bic)
-            for some, own, box in pairs
-        ]
+        if max(len(stop.joint), len(slowing.joint)) < LEAST_BRAKINGS:
+            raise ValueError(f"{len(drawn.joint)} events are too few; {LEAST_BRAKINGS} of a stratum are needed.")
         share = float(f"{len(stop.joint) / len(drawn.joint):.6g}")
-        strata = (
-            Stratum("slowing", 1.0 - share, best[1].distribution),
-            Stratum("stop", share, _with_loss(best[0].distribution, parameters)),
-        )
-        return StratifiedDistribution(strata, np.zeros(1), column=3, less=0), best
+        best: dict[str, SystemFit] = {}
+        strata = []
+        for name, some, own, box, w in (
+            ("slowing", slowing, slowing_systems, narrow, 1.0 - share),
+            ("stop", stop, systems, parameters[:3], share),
+        ):
+            if len(some.joint) >= LEAST_BRAKINGS:
+                fits = [fit_system(some, each, box, seed, starts) for each in own]
+                best[name] = min(fits, key=lambda fit: fit.bic)
+                base = best[name].distribution
+                strata.append(Stratum(name, w, _with_loss(base, parameters) if name == "stop" else base))
+        if len(strata) == 1:
+            strata = [strata[0]._replace(share=1.0)]
+        return StratifiedDistribution(tuple(strata), np.zeros(len(strata) - 1), column=3, less=0), best
 
     report("fit")
     fitted, best = fit_all(events, None)
-    rng, refits = np.random.default_rng(seed), []
+    rng, refits = np.random.default_rng(seed), list[StratifiedDistribution]()
     wanted = 0 if len(np.unique(events.clusters)) < MIN_CLUSTERS else N_REFITS if n_refits is None else n_refits
     while len(refits) < wanted:
         report(f"refit {len(refits) + 1} of {wanted}")
         drawn = draw_events(events, rng)
-        if min(len(each.joint) for each in split(drawn)) > parameters[3].size + len(parameters):
-            refits.append(fit_all(drawn, FOLD_STARTS)[0])
+        one = fit_all(drawn, FOLD_STARTS)[0] if min(_sizes(split(drawn), best)) >= LEAST_BRAKINGS else None
+        if one is not None:
+            refits.append(one)
     stop, slowing = split(events)
     checks: tuple[PredictiveCheck, ...] = ()
-    for name, own, base in (("stop", stop, fitted.strata[1].base), ("slowing", slowing, fitted.strata[0].base)):
+    for name, _, base in fitted.strata:
+        own = stop if name == "stop" else slowing
         checks += _check_pairs(name, BRAKING_STATES, own.joint[:, :3], base, (0, 1, 2), seed)
+    family = "; ".join(f"{name}: {fit.family}" for name, fit in best.items())
     record = {
         "kind": "fitted to recorded events",
-        "coordinates": f"stop: {best[0].system.name}; slowing: {best[1].system.name}",
-        "bic": round(best[0].bic + best[1].bic, 2),
+        "coordinates": "; ".join(f"{name}: {fit.system.name}" for name, fit in best.items()),
+        "bic": round(sum(fit.bic for fit in best.values()), 2),
         "source": dict(source),
         "filters": list(events.log),
         "strata": {"stop": len(stop.joint), "slowing": len(slowing.joint)},
@@ -403,8 +422,13 @@ def fit_hard_brake(
         distribution=fitted,
         refits=tuple(refits),
         events=events.counts,
-        family=f"stop: {best[0].family}; slowing: {best[1].family}",
+        family=family,
         frequency=frequency,
         checks=checks,
         record=record,
     )
+
+
+def _sizes(parts: tuple[EventSet, EventSet], kept: Mapping[str, Any]) -> list[int]:
+    """Return the numbers of brakings of strata that are kept, of those to a standstill and of others."""
+    return [len(part.joint) for part, name in zip(parts, ("stop", "slowing"), strict=True) if name in kept]

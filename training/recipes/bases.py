@@ -21,6 +21,7 @@ with a probability between 1e-4 and 1e-3, as in Tian et al. 2024, who fitted mix
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,8 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.scenarios.base import load_base
+from rare_envs.distributions.fitted import EventFrequency, FittedDistribution, join_independent
+from rare_envs.distributions.stratified import CutNormals
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
@@ -40,10 +41,11 @@ from training.data.events import (
     time_around_peak,
     time_between_spans,
 )
-from training.data.table import DT, VEHICLES_FILE, read_columns
+from training.data.table import DT, SCENES_FILE, VEHICLES_FILE, read_columns
 from training.fit.base import fit_base, format_base
 from training.fit.coordinates import COORDINATE_SYSTEMS
 from training.fit.filters import (
+    CLUSTER_FRAMES,
     EVENT_RECIPES,
     FILTER_REASONS,
     EventRecipe,
@@ -54,12 +56,25 @@ from training.fit.filters import (
     range_rule,
     read_csv_columns,
     read_events,
+    recorded_parameters,
+)
+from training.fit.strata import (
+    ATTITUDES,
+    NEAR_IF_UNSEEN,
+    Neighbours,
+    find_neighbours,
+    fit_cut_in,
+    fit_hard_brake,
+    keep_neighbours,
 )
 
 COMMAND = "rare-envs fit --data DIR --out rare_envs/data"
 FOLLOWING, CUT_IN_V0, CUT_IN_V1, BRAKING = "car_following", "rare_envs/CutIn-v0", "rare_envs/CutIn-v1", "hard_brake"
 CIRCLES_FILE, PROFILES_FILE = "i24_circles_following.parquet", "lane_change_profiles.parquet"
 CHANGES_FILE = "us101_lane_changes.csv"
+COIFMAN_FILE = "i80_coifman.parquet"
+US101_LANES, I80_LANES = 5, 6
+"""Lanes of the main road."""
 MIN_LANE_TIME = 3.0
 """Least time in one lane on either side of a change of a single vehicle on US 101 [s]."""
 MIN_JUMP, JUMP_TICKS, LEAST_PAUSE = 6.0, 3, 20
@@ -99,6 +114,8 @@ class ShippedBase:
     """Site whose lane changes have the columns apart."""
     system: str | None = None
     """Name of its coordinate system; None for the one that the events support best."""
+    test: bool = False
+    """Whether it is a base of `CutIn-v1` without strata, whose cutters refuse no gap."""
 
     @property
     def file(self) -> str:
@@ -109,7 +126,7 @@ class ShippedBase:
         """Return its events from the folder of compact tables."""
         if not isinstance(self.events, EventRecipe):
             return self.events(folder)
-        box = scenario_named(self.scenario).parameters
+        box = recorded_parameters(self.scenario)
         events = filter_events(read_events(folder / self.events.file, self.events), self.events, box)
         if self.changes:
             events = _add_changes(events, read_lane_changes(folder, self.changes), box[len(CUT_INS) :])
@@ -127,13 +144,52 @@ def fit_shipped_bases(
 
 def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int | None = None) -> str:
     """Return the text of the file of a base of the package, from the folder of compact tables."""
-    shipped = load_base(scenario_named(base.scenario), base.name)
-    assert isinstance(shipped, FittedDistribution)
+    file: Any = scenario_named(base.scenario).bases[base.name]
+    shipped = json.loads(file.read_text(encoding="utf-8"))
+    source, known = shipped["provenance"]["source"], shipped["frequency"]
     events, counted = base.read(data)
-    frequency = None if shipped.frequency is None else replace(shipped.frequency, **counted)
-    asked: dict[str, Any] = {"system": base.system, "n_refits": n_refits, "seed": seed}
-    fitted = fit_base(base.scenario, events, shipped.record["source"], COMMAND, frequency=frequency, **asked)
+    frequency = None if known is None else replace(EventFrequency(**known), **counted)
+    asked: dict[str, Any] = {"frequency": frequency, "n_refits": n_refits, "seed": seed}
+    if base.scenario == BRAKING:
+        fitted = fit_hard_brake(BRAKING, events, source, COMMAND, **asked)
+    elif base.scenario == CUT_IN_V1 and not base.test:
+        neighbours = read_neighbours(data, str(base.changes))
+        fitted = fit_cut_in(CUT_IN_V1, events, neighbours, source, COMMAND, **asked)
+    else:
+        fitted = fit_base(base.scenario, events, source, COMMAND, system=base.system, **asked)
+        fitted = _add_attitudes(fitted) if base.test else fitted
     return format_base(base.scenario, fitted.to_dict())
+
+
+def _add_attitudes(fitted: FittedDistribution) -> FittedDistribution:
+    """Return a distribution of starts, from which nobody was refused, with standard normal attitudes behind."""
+    free = CutNormals(np.full(ATTITUDES, -np.inf), np.full(ATTITUDES, np.inf))
+    kind = "test distribution: cutters as nobody drives, of gaps that drivers refuse too; fitted to recorded events"
+    return replace(
+        fitted,
+        distribution=join_independent(fitted.distribution, free),
+        refits=tuple(join_independent(each, free) for each in fitted.refits),
+        record={**fitted.record, "kind": kind},
+    )
+
+
+def read_neighbours(folder: Path, site: str) -> Neighbours:
+    """Return neighbours at random times of a site ("us101" or "i80"), every second of scenes or every other one."""
+    if site == "us101":
+        rows = read_columns(folder / SCENES_FILE, ("scene", "t", "lane", "y_along", "length", "speed"))
+        chosen = (rows["lane"] <= US101_LANES) & (np.round(rows["t"] / DT).astype(int) % 10 == 0)
+        rows = {name: values[chosen] for name, values in rows.items()}
+        front, cluster = rows["y_along"].astype(float), rows["scene"].astype(np.int64)
+        moment, rear = cluster * 10_000 + np.round(rows["t"] / DT).astype(int), front - rows["length"].astype(float)
+    else:
+        rows = read_columns(folder / COIFMAN_FILE, ("frame", "lane", "y_rear", "length", "speed"))
+        chosen = (rows["lane"] <= I80_LANES) & (rows["frame"] % 20 == 0)
+        rows = {name: values[chosen] for name, values in rows.items()}
+        length = rows["length"].astype(float)
+        rear, moment = rows["y_rear"].astype(float), rows["frame"]
+        front, cluster = rear + np.where(np.isnan(length), VEHICLE_LENGTH, length), moment // CLUSTER_FRAMES
+    found, own = find_neighbours(moment, rows["lane"], rear, front, rows["speed"].astype(float))
+    return keep_neighbours(CUT_IN_V1, found, np.asarray(cluster[own], dtype=np.int64), NEAR_IF_UNSEEN[site])
 
 
 def _read_i24_leaders(folder: Path) -> Read:
@@ -176,7 +232,7 @@ def find_new_leaders(speed: FloatArray, relative_speed: FloatArray, gap: FloatAr
 
 
 def _read_us101_brakings(folder: Path) -> Read:
-    """Return brakings to a standstill of single vehicles on US 101, at their beginning."""
+    """Return brakings of single vehicles on US 101, at their beginning."""
     table = read_columns(folder / VEHICLES_FILE, ("vehicle", "frame", "epoch_ms", "y_along", "space_headway"))
     order = np.lexsort([table["frame"], table["vehicle"]])
     edges = np.flatnonzero((np.diff(table["vehicle"][order]) != 0) | (np.diff(table["frame"][order]) != 1)) + 1
@@ -189,7 +245,7 @@ def _read_us101_brakings(folder: Path) -> Read:
         frames.append(table["epoch_ms"][track][onsets] // 100)
     recipe = replace(EVENT_RECIPES[BRAKING], cluster=("frame",))  # stop waves brake one vehicle after the other
     columns = dict(zip(recipe.columns, np.concatenate(parts).T, strict=True))
-    found = filter_events({"frame": np.concatenate(frames), **columns}, recipe, scenario_named(BRAKING).parameters)
+    found = filter_events({"frame": np.concatenate(frames), **columns}, recipe, recorded_parameters(BRAKING))
     # Without columns apart nothing is drawn for them, so that the refits stay those of the published file.
     found = replace(found, apart=np.empty((0, 0)))
     seconds, metres = braking_exposure(positions)
@@ -255,6 +311,7 @@ def _add_changes(events: EventSet, changes: FloatArray, box: Sequence[Any]) -> E
 
 
 _CLOSING = COORDINATE_SYSTEMS["cut_in"][2].name
+CUT_IN_SITES = (("us101", US101_CUT_INS), ("i80", I80_CUT_INS))
 SHIPPED_BASES = (
     ShippedBase(FOLLOWING, "us101", US101_PAIRS),
     ShippedBase(FOLLOWING, "us101-gap", US101_PAIRS, system="plain"),
@@ -263,9 +320,13 @@ SHIPPED_BASES = (
     ShippedBase(FOLLOWING, "i80-all-pairs", I80_PAIRS),
     ShippedBase(FOLLOWING, "i24", _read_i24_leaders),
     *(
-        ShippedBase(scenario, site + ending, recipe, site, system)
-        for scenario in (CUT_IN_V1, CUT_IN_V0)
-        for site, recipe in (("us101", US101_CUT_INS), ("i80", I80_CUT_INS))
+        ShippedBase(CUT_IN_V1, site + ending, recipe, site, test=bool(ending))
+        for site, recipe in CUT_IN_SITES
+        for ending in ("", "-test")
+    ),
+    *(
+        ShippedBase(CUT_IN_V0, site + ending, recipe, site, system)
+        for site, recipe in CUT_IN_SITES
         for ending, system in (("", None), ("-closing", _CLOSING))
     ),
     ShippedBase(CUT_IN_V0, "us101-15-offsets", US101_OFFSETS, system="log gaps"),

@@ -15,7 +15,7 @@ from training.data.events import (
     car_following_events,
     course_durations,
     cut_in_events,
-    find_standstill_brakings,
+    find_brakings,
     hard_brake_events,
     time_around_peak,
     write_events,
@@ -140,13 +140,16 @@ def test_brakings_are_found_with_their_size():
     np.testing.assert_allclose(events["speed"][own], SPEEDS, rtol=0.06)
     np.testing.assert_allclose(events["gap"][own], GAPS, rtol=1e-9)
     # the smooth deceleration overshoots a jump by up to a tenth
-    np.testing.assert_allclose(events["deceleration"][own], DECELERATIONS, rtol=0.12)
+    np.testing.assert_allclose(events["peak"][own], DECELERATIONS, rtol=0.12)
 
 
 def test_a_braking_counts_from_its_onset_to_a_standstill():
     """A hole 2.5 s after the onset: the track behind it begins in the braking. A hole before it leaves the braking."""
     table = stopping_traffic((14.0,), (15.0,), (2.5,))
-    assert len(hard_brake_events(stopping_traffic((14.0,), (15.0,), (2.5,), final=5.0))["frame"]) == 0
+    slowing = hard_brake_events(stopping_traffic((14.0,), (15.0,), (2.5,), final=5.0))
+    assert slowing["loss"] == pytest.approx(9.0, rel=0.05)  # 14 - 5 m/s
+    stops = hard_brake_events(table)
+    assert stops["loss"].tolist() == stops["speed"].tolist()
     for hole, found in ((None, 2), (25, 0), (-30, 2)):
         kept = table.select(np.full(len(table), True) if hole is None else np.abs(table.frame - PAUSE - hole) > 2)
         assert len(hard_brake_events(kept)["frame"]) == found
@@ -174,8 +177,8 @@ def test_a_track_that_runs_backwards_is_left_out():
     """A recorded position that freezes: the smoothed one overshoots and comes back."""
     position = stopping_track(12.0, 2.5)
     gap = np.full(len(position), 30.0)
-    assert len(find_standstill_brakings(position, gap)[0]) == 1
+    assert len(find_brakings(position, gap)[0]) == 1
     stop = position[-1]
     frozen = np.where(position > stop - 4.0, stop - 4.0, position)
     frozen[np.argmax(position > stop - 4.0) :] -= 1.0
-    assert len(find_standstill_brakings(frozen, gap)[0]) == 0
+    assert len(find_brakings(frozen, gap)[0]) == 0

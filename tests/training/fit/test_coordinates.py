@@ -20,7 +20,7 @@ from training.fit.coordinates import (
     held_out_log_prob,
     refit,
 )
-from training.fit.filters import EventSet
+from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import EM_ITERATIONS, SMALLEST_COMPONENT, TOLERANCE, fit_mixture, select_mixture
 
 
@@ -65,7 +65,7 @@ def test_a_start_leads_where_it_does_in_an_independent_implementation(points, co
 
 
 FOLLOWING = scenario_named("car_following").parameters
-CUT_IN = scenario_named("cut_in").parameters
+CUT_IN = recorded_parameters("cut_in")
 PLAIN, LOG_GAP, CLOSING = COORDINATE_SYSTEMS["car_following"]
 COMPONENT = ([1.0], [[15.0, 2.8, 0.0]], [np.diag([9.0, 0.16, 0.04])])
 """Speed, log gap, closing speed over the root of the gap."""

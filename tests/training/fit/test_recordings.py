@@ -24,7 +24,7 @@ from tests.training.data.recordings import (
 from training.command_line import EventOptions
 from training.data.events import braking_exposure, car_following_events, cut_in_events
 from training.data.table import synthetic_traffic
-from training.fit.filters import EVENT_RECIPES, filter_events, read_events
+from training.fit.filters import EVENT_RECIPES, filter_events, read_events, recorded_parameters
 from training.fit.recordings import count_events, fit_bases, fit_own_bases, observe_traffic
 
 GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
@@ -63,7 +63,7 @@ def test_filters_drop_and_count(tmp_path):
             ["start", *GOOD[:6], 1.2, True, "a", 12],  # faster than tyres allow
         ],
     )
-    recipe, box = EVENT_RECIPES["cut_in"], scenario_named("cut_in").parameters
+    recipe, box = EVENT_RECIPES["cut_in"], recorded_parameters("cut_in")
     events = filter_events(read_events(path, recipe), recipe, box)
     points, shapes, log = events.joint, events.apart, events.log
     # speeds and gaps count even where the offset at the start was not seen or is out of range, or the duration
@@ -118,9 +118,16 @@ def test_events_count_with_the_share_that_is_used():
 def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
     write_csv(tmp_path / "I294_L1.csv", tgsim_rows(simulated, radius=900.0, angle=2.6))
     files = fit(tmp_path / "bases", tgsim=tmp_path)
-    assert [file.name for file in files] == ["car_following_own.json", "cut_in_own.json"]
-    assert "hard_brake_events.csv: 0 events are too few" in capsys.readouterr().err  # nobody stops
-    for scenario, file in zip(("car_following", "cut_in"), files, strict=True):
+    assert [file.name for file in files] == [
+        "car_following_own.json",
+        "cut_in_own.json",
+        "hard_brake_own.json",
+    ]
+    assert [each.name for each in load_base(scenario_named("hard_brake"), files[2]).strata] == ["slowing"]
+    own = load_base(scenario_named("cut_in"), files[1])
+    assert [each.name for each in own.strata] == ["unseen", "looked"]
+    assert own.record["motion"]["cutters"]["events"] > 10
+    for scenario, file in zip(("car_following", "cut_in"), files, strict=False):
         points = load_base(scenario_named(scenario), file).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all() and 12.0 < points[:, 0].mean() < 25.0  # simulated: 9 to 27 m/s
         source = json.loads(file.read_text(encoding="utf-8"))["provenance"]["source"]
@@ -158,9 +165,11 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
     seconds, metres = braking_exposure(np.split(table.x, table.track_starts()[1:]))
     assert base.frequency.per_hour == pytest.approx(3600 * n / seconds, rel=1e-3)
     assert base.frequency.per_km == pytest.approx(1000 * n / metres, rel=1e-3)
-    assert [check.name for check in base.checks] == ["time headway < 0.5 s", "deceleration > 3 m/s^2", "gap < 3 m"]
-    selection = base.record["selection"]
-    assert [each["coordinates"] for each in selection] == ["plain", "log gap", "log gap, log deceleration"]
+    assert [check.name for check in base.checks] == [
+        f"stop: {name}" for name in ("time headway < 0.5 s", "gap < 3 m", "peak > 3 m/s^2")
+    ]
+    assert [each.name for each in base.strata] == ["stop"]  # nobody slowed only
+    assert (points[:, 3] >= points[:, 0]).all()
     dropped = {rule["rule"]: rule["dropped"] for rule in base.record["filters"] if rule.get("dropped")}
     assert dropped == {"gap is given": n}  # the leaders
 
