@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import samplers
+from samplers import plain_draws as kept_draws
 from samplers.method import Goal
-from samplers.methods import monte_carlo as kept_draws
 from samplers.plain_draws import KeptDraws
 
 
