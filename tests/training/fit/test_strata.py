@@ -1,0 +1,37 @@
+"""Strata fitted to events: what drivers accept, who is beside a lane, and how many do not look."""
+
+import numpy as np
+import pytest
+
+from rare_envs.distributions.acceptance import log_acceptance
+from training.fit.acceptance import fit_pair, profile_limit
+from training.fit.strata import UNSEEN_LOG_SD, find_neighbours, share_unseen
+
+
+def test_what_drivers_accept_is_found_again() -> None:
+    """Of 3,000 offers, closing by 0.5 +- 2 m/s, with b = 0.5: b to a third, the offers' mean to 0.2 m/s."""
+    rng = np.random.default_rng(0)
+    gap, closing = rng.lognormal(2.8, 0.7, 3000), rng.normal(0.5, 2.0, 3000)
+    kept = (gap > 1.0) & (gap < 120.0) & (rng.random(3000) < np.exp(log_acceptance(gap, closing, 0.5)))
+    found = fit_pair(closing[kept], gap[kept], (1.0, 120.0))
+    assert found.limit == pytest.approx(0.5, rel=0.35)
+    assert found.mean == pytest.approx([0.5, 2.8], abs=0.2)
+    profile = profile_limit(closing[kept], gap[kept], (1.0, 120.0))
+    assert max(profile, key=lambda b: profile[b]) == "0.5" and profile["0.5"] > 20.0
+
+
+def test_neighbours_are_those_between_whom_a_vehicle_would_come() -> None:
+    """Lane 2 has vehicles of 5 m at 0, 20 and 60 m; a vehicle beside, from 18 to 23 m, would come behind the third."""
+    rear = np.array([0.0, 20.0, 60.0, 18.0])
+    rows, own = find_neighbours(
+        np.zeros(4), np.array([2, 2, 2, 1]), rear, rear + 5.0, np.array([10.0, 11.0, 12.0, 13.0])
+    )
+    assert own.tolist() == [3]
+    assert rows.tolist() == [[11.0, 13.0, 12.0, -7.0, 37.0]]
+
+
+def test_the_share_who_do_not_look_is_that_of_44_events() -> None:
+    """One in 7,000 on US 101; 2 km of changes for one halve it. A factor of 4 either way at 95 %."""
+    assert share_unseen(0.26, 0.38) == pytest.approx(1.4e-4, rel=0.02)
+    assert share_unseen(0.52, 0.38) == pytest.approx(share_unseen(0.26, 0.38) / 2.0)
+    assert np.exp(1.96 * UNSEEN_LOG_SD) == pytest.approx(4.3, abs=0.1)
