@@ -12,6 +12,13 @@ With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in st
 t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum without a failure goes on, as far as
 max_sim allows, while it may add more than is known: w_k h_k > p, with h_k the upper end of its p_k.
 
+Where nothing fails in a stratum, or hardly anything (a c.o.v. of 1), simulations that are left are plain draws, which
+bring its upper end down: so are the `plain_draws` that a problem offers where there is no max_sim, as it does where they
+take seconds.
+
+Where the method is `Auto`, pilots are plain draws, and a stratum in which some of them failed goes on with plain draws:
+where p_k is above some 0.005 a search gains little, and it may miss one of many regions.
+
 References:
     Neyman, "On the two different aspects of the representative method", Journal of the Royal Statistical Society 97,
     1934.
@@ -27,7 +34,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.combination import combine, dilute, pool_counts, sum_strata
+from samplers.combination import UNINFORMATIVE_COV, combine, dilute, pool_counts, sum_strata
 from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, choose_method, offer_of
 from samplers.plain_draws import PlainDraws
 from samplers.problem import Distribution, FloatArray, Inputs
@@ -38,6 +45,10 @@ PILOT_SHARE = 0.25
 """Share of max_sim for the pilots."""
 FEWEST = 20
 """Simulations for each stratum up to which there are no pilots: all are made at once, in equal parts."""
+PILOT_DRAWS = 1000
+"""Draws of a pilot of plain draws where there is no max_sim."""
+OFTEN = 4
+"""Failures of a pilot of plain draws from which its stratum needs no search."""
 PILOT_COV = 0.3
 """C.o.v. at which pilots stop where there is a target; a larger target takes its place."""
 MARGIN = 0.9
@@ -92,8 +103,8 @@ class SumOfStrata:
         return _Sum(self, inputs, goal, rng).steps()
 
 
-Task = tuple[int, int | None, float | None]
-"""A run to be made: the number of its stratum, its max_sim and its target_cov."""
+Task = tuple[int, int | None, float | None, Stepping | None]
+"""A run to be made: the number of its stratum, its max_sim, its target_cov, and a method in place of the usual one."""
 
 
 class _Sum:
@@ -101,7 +112,7 @@ class _Sum:
 
     def __init__(self, method: SumOfStrata, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> None:
         self.method, self.strata, self.inputs, self.goal, self.rng = method.method, method.strata, inputs, goal, rng
-        self.plain_draws = method.plain_draws
+        self.plain_draws, self.chooses = method.plain_draws, hasattr(method.method, "choose")  # of `Auto`, or a user's
         nothing = replace(
             NOT_KNOWN,
             status=Status.BUDGET,
@@ -111,7 +122,7 @@ class _Sum:
         self.behind = np.zeros(len(self.strata))
         """Simulations of the runs behind the outcomes."""
         self.trace = list[Level]()
-        self.n_sim, self.stopped, self.at_limit = 0, False, set[int]()
+        self.n_sim, self.stopped, self.searched, self.at_limit = 0, False, False, set[int]()
 
     def steps(self) -> Steps:
         """Make rounds of runs until there is nothing to add."""
@@ -121,24 +132,26 @@ class _Sum:
                 if not self.stopped:
                     yield from self._run(*task)
             rounds += 1
-            more = not self.stopped and rounds <= (1 if self.goal.target_cov is None else MOST_ROUNDS)
-            tasks = self._plan_more() if more else []
-        for stratum, n in self._plan_plain_draws():
+            most = 1 + self.chooses if self.goal.target_cov is None else MOST_ROUNDS
+            more = not self.stopped and rounds <= most
+            tasks = (self._plan_searches() if self.chooses and rounds == 1 else self._plan_more()) if more else []
+        for task in self._plan_plain_draws():
             if not self.stopped:
-                yield from self._run(stratum, n, None, PlainDraws())
+                yield from self._run(*task)
         return sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
 
     def _plan_pilots(self) -> list[Task]:
         """Return a first run for every stratum, or for the largest ones where there are fewer simulations."""
         k, n, target = len(self.parts), self.goal.max_sim, self.goal.target_cov
         target = max(target, PILOT_COV) if target is not None and self.method.stops_at_target else None
+        method = PlainDraws() if self.chooses else None
         if n is None:
-            return [(i, None, target) for i in range(k)]
+            return [(i, PILOT_DRAWS if self.chooses else None, target, method) for i in range(k)]
         few = n < FEWEST * k
         sizes = np.full(k, n // k if few else int(PILOT_SHARE * n) // k)
         if few:
             sizes[np.argsort([-part.share for part in self.parts], kind="stable")[: n % k]] += 1
-        return [(i, int(size), target) for i, size in enumerate(sizes) if size]
+        return [(i, int(size), target, method) for i, size in enumerate(sizes) if size]
 
     def _plan_more(self) -> list[Task]:
         """Return the runs to make beside those made."""
@@ -152,19 +165,47 @@ class _Sum:
                 use[i] = i not in self.at_limit and (late if part.p > 0 else may_add_most)
         elif self.goal.max_sim is None:
             return []
-        sizes = [None] * k if self.goal.max_sim is None else [int(n) for n in self._allocate(use)]
+        known = self.goal.max_sim is not None
+        sizes: list[int | None] = [int(n) for n in self._allocate(use)] if known else [None] * k
         for i, size in enumerate(sizes):
             if size is not None and self.parts[i].p == 0:
                 sizes[i] = min(size, PLENTY)
-        return [(i, sizes[i], targets[i]) for i in range(k) if use[i] and sizes[i] != 0]
+        return [(i, sizes[i], targets[i], self._find_method(i)) for i in range(k) if use[i] and sizes[i] != 0]
 
-    def _plan_plain_draws(self) -> list[tuple[int, int]]:
-        """Return the strata in which nothing failed, each with its part of the simulations left for plain draws."""
+    def _plan_searches(self) -> list[Task]:
+        """Return the runs after pilots of plain draws: half of what is left for the strata that hardly failed in them.
+
+        Without a max_sim they have the simulations that their method likes, and the others as many plain draws as cost
+        seconds.
+        """
+        k, left = len(self.parts), self.goal.max_sim and self.goal.max_sim - self.n_sim
+        self.searched = True
+        rare = [i for i in range(k) if (self.parts[i].outcome.counts or (0, 0))[0] < OFTEN]
+        if left is not None and rare and left >= 2 * FEWEST * len(rare):
+            return [(i, min(PLENTY, left // 2 // len(rare)), self.goal.target_cov, None) for i in rare]
+        if self.goal.target_cov is not None or left is not None:
+            return self._plan_more()
+        plenty = self.plain_draws or PLENTY
+        return [(i, None if i in rare else plenty, None, None if i in rare else PlainDraws()) for i in range(k)]
+
+    def _find_method(self, stratum: int) -> Stepping | None:
+        """Return plain draws for a stratum in whose pilot some failed, or that was searched in vain; else None."""
+        hits, _ = self.parts[stratum].outcome.counts or (0, 0)
+        in_vain = self.searched and self._is_unresolved(stratum)
+        return PlainDraws() if self.chooses and (hits >= OFTEN or in_vain) else None
+
+    def _is_unresolved(self, stratum: int) -> bool:
+        """Return whether simulations of a stratum have met no failure, or too few to say how likely they are."""
+        part = self.parts[stratum]
+        return part.n_sim > 0 and (part.p == 0 or part.cov >= UNINFORMATIVE_COV)
+
+    def _plan_plain_draws(self) -> list[Task]:
+        """Return plain draws for the strata that are not resolved, of the simulations left by their shares."""
         n = self.plain_draws if self.goal.max_sim is None else self.goal.max_sim - self.n_sim
-        empty = [i for i, part in enumerate(self.parts) if part.p == 0 and part.n_sim]
+        empty = [i for i in range(len(self.parts)) if self._is_unresolved(i)]
         whole = sum(self.parts[i].share for i in empty)
         drawn = [(i, int(n * self.parts[i].share / whole)) for i in empty]
-        return [(i, size) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
+        return [(i, size, None, PlainDraws()) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
 
     def _allocate(self, use: NDArray[np.bool_]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
@@ -182,7 +223,7 @@ class _Sum:
         return sizes
 
     def _run(
-        self, stratum: int, max_sim: int | None, target_cov: float | None, method: Stepping | None = None
+        self, stratum: int, max_sim: int | None, target_cov: float | None, method: Stepping | None
     ) -> Generator[FloatArray, FloatArray, None]:
         """Make a run in a stratum; where its method does not stop at a target, as many as that takes."""
         part, n_before = self.parts[stratum], self.n_sim
@@ -235,6 +276,10 @@ class _Sum:
             about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
             return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
+        if found.p == 0 < old.p and found.counts is not None and old.cov >= UNINFORMATIVE_COV:
+            low, high = old.interval  # of a search that hardly met any; as many plain draws say that it is rare
+            high = max(min(high, zero_hit_bound(found.base_draws, self.goal.confidence)), old.p)
+            return replace(old, interval=(low, high), base_draws=drawn), n_old
         if found.p == 0 == old.p:
             return replace(found, interval=(0.0, zero_hit_bound(drawn, self.goal.confidence)), base_draws=drawn), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost
