@@ -13,8 +13,8 @@ t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum
 max_sim allows, while it may add more than is known: w_k h_k > p, with h_k the upper end of its p_k.
 
 Where nothing fails in a stratum, or hardly anything (a c.o.v. of 1), simulations that are left are plain draws, which
-bring its upper end down: so are the `plain_draws` that a problem offers where there is no max_sim, as it does where they
-take seconds.
+bring its upper end down: so are the `plain_draws` that a problem offers where there is no max_sim, as it does where
+they take seconds.
 
 Where the method is `Auto`, pilots are plain draws, and a stratum in which some of them failed goes on with plain draws:
 where p_k is above some 0.005 a search gains little, and it may miss one of many regions.

@@ -474,7 +474,7 @@ def test_where_nothing_fails_further_simulations_are_plain_draws() -> None:
     failing = FunctionProblem(lambda x: 1.0 - x[:, 0], dim=1)  # Phi(-1) = .159
     problem = StratifiedProblem([Stratum("safe", 0.9, safe), Stratum("failing", 0.1, failing)])
     problem.plain_draws = 50_000
-    nothing, found = samplers.estimate(problem, seed=0).parts
+    nothing, _ = samplers.estimate(problem, seed=0).parts
     assert nothing.n_sim >= 50_000
     assert nothing.interval[0] == 0 < nothing.interval[1] <= 1 - 0.05 ** (1 / 50_000)
     limited = samplers.estimate(problem, seed=0, max_sim=40_000)
