@@ -312,8 +312,11 @@ class Report:
         base, env_id = self.study.problem.base, self.study.question.env_id
         parts = split_by_stratum(self.estimate, base)
         whole = {part.name: part.value / self.estimate.p for part in parts if self.estimate.p > 0}
+        whole_p = self.rate.probability
+        most = whole_p.upper if whole_p.interval is None or not whole_p.determined else whole_p.interval[1]
         found = [
-            (part.name, part.share, self._rate_of(part.value, part.cov, part.interval, part.base)) for part in parts
+            (part.name, part.share, self._rate_of(part.value, part.cov, part.interval, part.base, most))
+            for part in parts
         ]
         if not parts or any(part.name not in COUNTED for part in parts):
             found = [(self.rate.scenario, 1.0, self.rate)]
@@ -339,9 +342,14 @@ class Report:
         return self._rate_of(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
 
     def _rate_of(
-        self, value: float, cov: float, sampling: Interval, uncertainty: samplers.BaseUncertainty | None
+        self,
+        value: float,
+        cov: float,
+        sampling: Interval,
+        uncertainty: samplers.BaseUncertainty | None,
+        most: float = 1.0,
     ) -> CollisionRate | None:
-        """Return the rate of what has a value per event; its interval is that of the base where there is one."""
+        """Return the rate of what has a value per event, at most that of the whole: with its base's interval if any."""
         if self.no_rate:
             return None
         known, spread = value > 0 and math.isfinite(cov), {}
@@ -356,7 +364,7 @@ class Report:
         return CollisionRate(
             scenario=self.study.problem.world.scenario.name,
             probability=CollisionProbability(
-                p=value, cov=cov, upper=upper, interval=ends, determined=determined, **spread
+                p=value, cov=cov, upper=min(upper, most), interval=ends, determined=determined, **spread
             ),
             frequency=find_frequency(self.study),
             confidence=self.estimate.confidence,
