@@ -1,6 +1,6 @@
-"""The main job, end to end: train a small PPO ego, then ask how often it crashes and how.
+"""The main job, end to end: train a PPO ego, then ask how often it crashes, how, and what that is per million km.
 
-python examples/demo.py [--steps 400000] [--out runs/demo]
+python examples/demo.py [--steps 1000000] [--out runs/demo]
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.study import Question, prepare, run, write_run
+from rare_envs.scenarios.registry import env_id_of
+from rare_envs.study.risk import SCENARIO_SET, risk
 from rare_envs.study.text import print_report
 from training import train_ego
 
-ENV_ID = "rare_envs/CutIn-v0"
+ENV_ID = "rare_envs/CutIn-v1"
 
 
 class RandomPolicy:
@@ -47,39 +48,39 @@ def random_collision_rate(n: int = 1_000, seed: int = 0) -> float:
 
 
 def demo(steps: int, out: Path) -> None:
-    """Train an ego, estimate its collision probability, write numbers and picture, and say what to do next.
+    """Train an ego, estimate its collision probabilities, write numbers and pictures, and say what to do next.
 
     Args:
         steps: Environment steps of training.
         out: Folder for everything that is written.
     """
     torch.set_num_threads(1)  # batches this small are slower on more
-    print(f"1. Training a PPO ego in {ENV_ID} for {steps:,} steps.", flush=True)
-    # torch's steps, so that the ego is the same with and without numba
-    ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip", core="torch")
+    environments = tuple(map(env_id_of, SCENARIO_SET))
+    print(f"1. Training a PPO ego in {' and '.join(environments)} for {steps:,} steps.", flush=True)
+    ego = train_ego(environments, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
 
     print("2. Estimating how often it collides: find failures, then estimate from draws made for them.", flush=True)
-    study = prepare(Question(env_id=ENV_ID, ego=str(ego), seed=0, trust=True))  # it has just been written
-    report = run(study, progress=True)
-    write_run(out, report)
+    found = risk(str(ego), out=out, seed=0, trust=True, progress=True, force=True)  # it has just been written
 
     print()
-    print_report(report, out)
+    cut_in = found.scenarios[0]
+    print_report(cut_in.report, out / cut_in.name)
     random_rate = random_collision_rate()
     print(f"for comparison: a policy that acts at random collides in {random_rate:.0%} of 1,000 scenarios")
+    print(f"\n{found}")
     print("\nNext, from the folder of this repository (the commands are in .venv/bin):")
     for words, why in (
-        (f"{ENV_ID} --ego {ego} --method mc --max-sim 1000000", "check the number by plain Monte Carlo"),
-        (f"{ENV_ID} --out runs/idm", "the same question for the rule-based ego"),
-        (f"{ENV_ID} --ego {ego} --base highway", "the same ego in free-flowing traffic"),
+        (f"estimate {ENV_ID} --ego {ego} --method mc --max-sim 1000000", "check the first number by plain Monte Carlo"),
+        ("risk idm --out runs/idm", "the same question for the rule-based ego"),
+        ("risk human --out runs/human", "and for a model of human drivers"),
+        ("train-ego all --steps 2000000 --out better.zip", "train for longer, then ask again"),
     ):
-        print(f"  rare-envs estimate {words}\n      {why}")
-    print(f"  rare-envs train-ego {ENV_ID} --steps 1000000 --out better.zip\n      train for longer, then ask again")
+        print(f"  rare-envs {words}\n      {why}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=400_000)
+    parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--out", type=Path, default=Path("runs/demo"))
     arguments = parser.parse_args()
     demo(arguments.steps, arguments.out)

@@ -2,8 +2,8 @@
 
     python -m benchmarks.driving.egos
 
-trains a PPO and a DQN ego in each scenario as the demo does, unless they are there already, asks `TwoStage` and
-`AdaptiveSubsetSimulation` about every ego in every scenario, and writes
+trains a PPO and a DQN ego in each scenario as `rare-envs train-ego` does, unless they are there already, asks `TwoStage`
+and `AdaptiveSubsetSimulation` about every ego in every scenario, and writes
 benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
 vision,ppo`. The rows of `vision`, whose pictures take time, come by
 
@@ -27,7 +27,7 @@ from training import train_ego
 
 EGOS_RESULT = RESULTS / "egos.json"
 STEPS = 400_000
-"""Of the training of an ego, as in the demo."""
+"""Of the training of an ego."""
 TRAINED = ("ppo", "dqn")
 """Egos that are trained here."""
 EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")

@@ -39,7 +39,7 @@ STEPS, ROWS = 64, 8
 ALGORITHMS = ("ppo", "a2c", "sac", "td3", "dqn")
 EACH = [pytest.param(algo, marks=() if algo in ("ppo", "dqn") else pytest.mark.slow) for algo in ALGORITHMS]
 FACTOR = 20.0
-"""After 100,000 steps; the demo's 400,000 reach several thousand."""
+"""After 100,000 steps."""
 FAILURE = np.array([[25.0, 12.0, 20.0, 2.0, 40.0, 3.5]])
 
 
