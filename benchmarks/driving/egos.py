@@ -2,8 +2,8 @@
 
     python -m benchmarks.driving.egos
 
-trains a PPO and a DQN ego in each scenario as `rare-envs train-ego` does, unless they are there already, asks `TwoStage`
-and `AdaptiveSubsetSimulation` about every ego in every scenario, and writes
+trains a PPO and a DQN ego in each scenario as `rare-envs train-ego` does, unless they are there already, asks
+`TwoStage` and `AdaptiveSubsetSimulation` about every ego in every scenario, and writes
 benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
 vision,ppo`. The rows of `vision`, whose pictures take time, come by
 

@@ -10,7 +10,6 @@ are replaced, all others stay.
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -117,12 +116,12 @@ def main(
     command = "python -m benchmarks.estimators.roads --ego idm,human,runs/demo/ego.zip"
     for name in ego.split(","):
         for env_id in (each for each in ENVS if env in each):
-            problem, label, rows = make_problem(env_id, name), Path(name).name, list[StratumRow]()
+            problem, rows = make_problem(env_id, name), list[StratumRow]()
             if draws:
                 most = draws if problem.core == "numba" else slow_draws
-                rows += draw_plain(problem, label, most, 0)
+                rows += draw_plain(problem, name, most, 0)
             for each in method.split(",") if method else ():
-                rows += (row for seed in range(seeds) for row in run_method(problem, label, each, seed, max_sim))
+                rows += (row for seed in range(seeds) for row in run_method(problem, name, each, seed, max_sim))
             for row in rows:
                 gain = "" if row.gain is None else f"{row.gain:.3g}"
                 print(*row[:5], f"{row.p:.2e} {row.low:.2e} {row.high:.2e}", row.n_sim, gain, row.by, row.doubts)
