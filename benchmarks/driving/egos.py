@@ -5,9 +5,10 @@
 trains a PPO and a DQN ego in each scenario as `rare-envs train-ego` does, unless they are there already, asks
 `TwoStage` and `AdaptiveSubsetSimulation` about every ego in every scenario, and writes
 benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
-vision,ppo`. The rows of `vision`, whose pictures take time, come by
+vision,ppo`. The rows of `CutIn-v1` and `HardBrake-v0` come by
 
-    python -m benchmarks.driving.egos --only vision --methods two-stage --env HardBrake-v0 --at-most 600
+    python -m benchmarks.driving.egos --env HardBrake-v0 --only idm,ppo,dqn --steps 100000 --methods two-stage \
+        --at-most 20000
 """
 
 import json
