@@ -21,12 +21,11 @@ from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.method import Stepping
 from samplers.methods import Auto, get_method
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Inputs, OnError, Problem, StandardNormal, check_number
+from samplers.problem import Inputs, OnError, Problem, StandardNormal, check_number, read_strata
 from samplers.replicate import InputsOnly
 from samplers.result import Estimate
 from samplers.run import Listener, Progress, Run, RunArguments, check_problem, choose_seed
 from samplers.sample import Status
-from samplers.strata import read_strata
 
 DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 NARROW_TERMINAL = 72

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import Goal, Interrupted, Outcome, Steps
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import DrawWeights, Level, Sample, Status, binomial_cov
 
 MOST_DRAWS = 2**20
@@ -88,6 +88,10 @@ class PlainDraws:
 
     name: ClassVar[str] = "mc"
     stops_at_target: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_settings(self, n=1, batch=1)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Draw batches until the target or the end of the budget."""

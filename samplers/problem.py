@@ -19,6 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from samplers.distributions import LOG_TWO_PI, as_distribution
 
+SHARE_ROUNDING = 1e-6
+"""Shares of strata add up to 1 within this."""
+
 
 def is_number(value: object) -> TypeGuard[float]:
     """Return whether value is a real number (a bool is none) that a float can hold."""
@@ -260,6 +263,29 @@ class TermGradients:
     """Gradient with respect to x of the term asked for, shape (n, d); NaN in rows that have none."""
     cost: float
     """Simulations that they took, all rows together."""
+
+
+def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
+    """Raise a ValueError unless strata have different names and shares above 0 that add up to 1."""
+    if len(set(names)) < len(names) or not all(isinstance(name, str) and name for name in names):
+        raise ValueError(f"Expected strata with different names, got {', '.join(map(repr, names))}.")
+    if not all(share > 0 for share in shares) or abs(math.fsum(shares) - 1) > SHARE_ROUNDING:
+        given = " + ".join(f"{share:.6g}" for share in shares)
+        raise ValueError(f"Expected shares of strata above 0 that add up to 1, got {given} = {math.fsum(shares):.6g}.")
+
+
+def read_strata(base: Any) -> tuple[Any, ...]:
+    """Return the strata of a base distribution (see `samplers.Distribution`), none where it has fewer than two.
+
+    Raises:
+        ValueError: If names, shares or bases do not fit.
+    """
+    strata = tuple(getattr(base, "strata", None) or ())  # a base distribution need not have it
+    check_shares([stratum.name for stratum in strata], [stratum.share for stratum in strata] or [1.0])
+    for stratum in strata:
+        if not isinstance(stratum.base, Distribution):
+            raise ValueError(f"Expected a base distribution of stratum {stratum.name!r}, got {stratum.base!r}.")
+    return strata if len(strata) > 1 else ()
 
 
 def names_of_columns(problem: Inputs) -> tuple[str, ...]:

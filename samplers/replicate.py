@@ -1,20 +1,22 @@
-"""Replicate: one run of a method between its requests and the answers; whether one more is to be made for a target."""
+"""Runs of a method: one between its requests and answers, another for a target, several as one, sums over strata."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
+from scipy.special import chdtrc, stdtrit
 
-from samplers.combination import combined_cov, pool_counts
 from samplers.method import (
     Answer,
     Goal,
     Interrupted,
     Outcome,
+    Part,
     Request,
     Stepping,
     Steps,
@@ -22,7 +24,7 @@ from samplers.method import (
     whole_simulations,
 )
 from samplers.problem import Distribution, FloatArray, TermGradients, Terms
-from samplers.sample import Status
+from samplers.sample import DrawWeights, Interval, Level, Sample, Status, binomial_cov
 
 MIN_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
@@ -174,3 +176,253 @@ def _check_outcome(value: object) -> Outcome:
     if not isinstance(value, Outcome):
         raise TypeError(f"Expected the steps of the method to return an Outcome, got {value!r}.")
     return value
+
+
+# Several as one
+
+OWN_ERROR_FACTOR = 1.5
+"""Factor by which runs may understate their own errors before they are said to disagree."""
+MIN_SPREAD = 1 / 3
+"""Least spread of runs, as a share of their own errors: they are closer together by chance, such as counts that tie."""
+UNINFORMATIVE_COV = 1.0
+"""From this c.o.v. on the p of a run adds nothing to its interval."""
+DISAGREEMENT_LEVEL = 1e-4
+"""Probability that runs whose errors are right are said to disagree."""
+STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
+"""The status of the combined runs is the first of these that one of them has."""
+
+
+def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
+    """Return R independent runs as one: pooled counts, or their mean with a t interval.
+
+    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer run, with the
+    Clopper-Pearson interval: a t interval would ignore that the spread of counts is known. Otherwise p is the mean of
+    p-hat (unbiased; its logarithm is not). Runs that were stopped before their end are left out of the mean if any run
+    came to its end: one that has not reached the failures has p-hat = 0. Their levels stay in the trace. Of sums over
+    strata each part is combined so, and the parts are added.
+    """
+    if len(outcomes) == 1:
+        return outcomes[0]
+    trace = tuple(replace(level, run=i) for i, outcome in enumerate(outcomes) for level in outcome.trace)
+    if outcomes[0].parts:
+        same = [list(parts) for parts in zip(*(outcome.parts for outcome in outcomes), strict=True)]
+        wholes = [replace(combine([part.outcome for part in parts], confidence), trace=()) for parts in same]
+        counts_of = [sum(part.n_sim for part in parts) for parts in same]
+        added = zip(outcomes[0].parts, wholes, counts_of, strict=True)
+        return sum_strata([replace(part, outcome=whole, n_sim=n) for part, whole, n in added], confidence, trace)
+    counts = pool_counts(outcomes)
+    used = outcomes if counts else [each for each in outcomes if each.status is not Status.STOPPED] or outcomes
+    shares = [each.counts[1] / counts[1] if counts and each.counts else 1 / len(used) for each in used]
+    remarks, weights = _collect_texts([each.remarks for each in used]), _share_weights(outcomes, used, shares)
+    if counts:
+        hits, n = counts
+        no_outcome = sum(each.no_outcome_share * each.counts[0] for each in used if each.counts)
+        whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
+        return replace(whole, sample=_merge_samples(used, shares), draw_weights=weights, remarks=remarks)
+    left_out = len(outcomes) - len(used)
+    about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
+    if len(used) == 1:
+        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about), draw_weights=weights)
+    p = np.array([outcome.p for outcome in used])
+    mean = float(p.mean())
+    present = {outcome.status for outcome in used}
+    status = next((each for each in STATUS_PRIORITY if each in present), Status.BUDGET)
+    return Outcome(
+        p=mean,
+        interval=_mean_interval(used, p, confidence),
+        cov=combined_cov(used),
+        status=status if mean > 0 else Status.NO_HITS,
+        warnings=(*_collect_texts([outcome.warnings for outcome in used]), *about, *_warn_of_disagreement(used, p)),
+        remarks=remarks,
+        trace=trace,
+        no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
+        sample=_merge_samples(used, shares),
+        base_draws=sum(outcome.base_draws for outcome in used),
+        draw_weights=weights,
+    )
+
+
+def pool_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
+    """Return failing and all draws of the runs together; None if a run is no share of plain draws."""
+    counts = [outcome.counts for outcome in outcomes if outcome.counts is not None]
+    if len(counts) < len(outcomes):
+        return None
+    return sum(hits for hits, _ in counts), sum(n for _, n in counts)
+
+
+def combined_cov(outcomes: Sequence[Outcome]) -> float:
+    """Return the c.o.v. of the combined runs: of pooled counts or, for a mean, the larger of the own and that seen."""
+    counts = pool_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        return binomial_cov(hits / n, n)
+    if outcomes[0].parts:
+        return combine(outcomes, Goal.confidence).cov
+    p = np.array([outcome.p for outcome in outcomes])
+    if not p.any():
+        return math.inf
+    seen = float((p / p.mean()).std(ddof=1)) if len(p) > 1 else 0.0
+    return max(_own_error(outcomes), seen) / math.sqrt(len(p))
+
+
+def _own_error(outcomes: Sequence[Outcome]) -> float:
+    """Return the root mean square of the errors that the runs state, relative to the mean of their p."""
+    mean = float(np.mean([outcome.p for outcome in outcomes]))
+    errors = [outcome.p / mean * outcome.cov for outcome in outcomes if outcome.p > 0]  # p squared might underflow
+    return math.hypot(*errors) / math.sqrt(len(outcomes))
+
+
+def _mean_interval(outcomes: Sequence[Outcome], p: FloatArray, confidence: float) -> Interval:
+    """Return the interval p_bar exp(-+ t s / sqrt(R)) of the mean of p (R,), t with R - 1 degrees of freedom.
+
+    s is the standard deviation of log p-hat (of p-hat / p_bar, where a run has p-hat = 0), but at least a third of the
+    runs' own c.o.v. Where no run has a c.o.v. under 1 their spread is not known either: the interval then covers the
+    intervals of all runs.
+    """
+    mean, runs = float(p.mean()), len(p)
+    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
+        return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
+    spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
+    spread = max(spread, MIN_SPREAD * _own_error(outcomes))
+    half = float(stdtrit(runs - 1, 0.5 + confidence / 2)) * spread / math.sqrt(runs)
+    return mean * math.exp(-half), min(1.0, mean * math.exp(half))
+
+
+def _warn_of_disagreement(outcomes: Sequence[Outcome], p: FloatArray) -> list[str]:
+    """Return a warning if runs with p (R,) lie further apart than their errors allow: some of them missed a region."""
+    error = OWN_ERROR_FACTOR * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
+    if len(p) < 3 or not (error > 0).all():
+        return []
+    with np.errstate(over="ignore"):  # inf is far enough apart
+        apart = float((((p - p.mean()) / error) ** 2).sum())
+    if chdtrc(len(p) - 1, apart) > DISAGREEMENT_LEVEL:
+        return []
+    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
+
+
+def _merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
+    """Return the points behind a mean of R runs with these shares, or None if a run does not give its own."""
+    samples = [outcome.sample for outcome in outcomes if outcome.sample is not None]
+    if len(samples) < len(outcomes):
+        return None
+    first_units = np.cumsum([0, *(sample.n_units for sample in samples)])
+    parts = list(zip(first_units, shares, samples, strict=False))
+    layers = tuple(
+        replace(layer, weights=share * layer.weights, units=first + layer.units)
+        for first, share, sample in parts
+        for layer in sample.all_layers
+    )
+    return Sample(
+        f=np.concatenate([sample.f for sample in samples]),
+        weights=np.concatenate([share * sample.weights for _, share, sample in parts]),
+        units=np.concatenate([first + sample.units for first, _, sample in parts]),
+        n_units=int(first_units[-1]),
+        x=np.concatenate([sample.x for sample in samples]),
+        layers=layers if any(sample.layers for sample in samples) else (),
+        lineages=sum(sample.lineages for sample in samples),
+    )
+
+
+def _share_weights(
+    outcomes: Sequence[Outcome], used: Sequence[Outcome], shares: Sequence[float]
+) -> tuple[DrawWeights, ...]:
+    """Return the weights of single simulations in a mean of the runs used, by share; none where a run gives none."""
+    if not all(outcome.draw_weights for outcome in used):
+        return ()
+    number = {id(outcome): run for run, outcome in enumerate(outcomes)}
+    return tuple(
+        replace(weights, run=number[id(outcome)], log_share=weights.log_share + math.log(share))
+        for outcome, share in zip(used, shares, strict=True)
+        for weights in outcome.draw_weights
+    )
+
+
+def _collect_texts(of_runs: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the warnings or remarks of runs, each once, with the number of runs that have it."""
+    texts = Counter(text for run in of_runs for text in run)
+    return tuple(f"In {count} of {len(of_runs)} runs: {text}" for text, count in texts.items())
+
+
+# Strata
+
+UNRESOLVED_SHARE = 0.1
+"""Part of p from which what strata without a failure may add is worth a remark."""
+
+
+def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...]) -> Outcome:
+    """Return p = sum_k w_k p_k over independent estimates of all strata.
+
+    Its ends come from those of the parts, l_k and h_k (method of variance estimates recovery, Zou and Donner, 2008):
+
+        p - sqrt(sum_k (w_k (p_k - l_k))^2),    p + sqrt(sum_k (w_k (h_k - p_k))^2),
+
+    so that a part without a failure raises the upper end alone. What is said of such a part is a remark where other
+    parts failed: its upper end rests on the draws from its base.
+
+    References:
+        Zou and Donner, "Construction of confidence limits about effect measures: a general approach", Statistics in
+        Medicine 27, 2008.
+    """
+    p = sum(part.share * part.p for part in parts)
+    n_units = [0 if part.outcome.sample is None else part.outcome.sample.n_units for part in parts]
+    of_sum = [part.share * part.p / p if p > 0 else math.nan for part in parts]
+    parts = tuple(map(lambda part, of, n: replace(part, of_sum=of, n_units=n), parts, of_sum, n_units))
+    found, present = [part for part in parts if part.p > 0], {part.outcome.status for part in parts}
+    below = math.hypot(*(part.share * (part.p - part.interval[0]) for part in parts))
+    above = math.hypot(*(part.share * (part.interval[1] - part.p) for part in parts))
+    status = next((each for each in STATUS_PRIORITY if each in present), Status.NO_HITS)
+    warnings, remarks = list[str](), list[str]()
+    for part in parts:
+        resolved = p == 0 or part.outcome.status is not Status.NO_HITS
+        (warnings if resolved else remarks).extend(f"{part.name}: {text}" for text in part.outcome.warnings)
+        remarks += [f"{part.name}: {text}" for text in part.outcome.remarks]
+    most = math.hypot(*(part.share * part.interval[1] for part in parts if part.p == 0))
+    if most > UNRESOLVED_SHARE * p > 0:
+        names = " and ".join(part.name for part in parts if part.p == 0)
+        remarks.append(f"The c.o.v. is that of the strata with failures alone; {names} may add up to {most:.1e}.")
+    simulated = [part for part in parts if part.n_sim]
+    known = all(part.outcome.draw_weights for part in simulated)
+    return Outcome(
+        p=min(p, 1.0),
+        interval=(max(p - below, 0.0), min(p + above, 1.0)),
+        cov=math.hypot(*(part.of_sum * part.cov for part in found)) if found else math.inf,
+        status=status if p > 0 or status is Status.STOPPED else Status.NO_HITS,
+        warnings=tuple(warnings),
+        remarks=tuple(remarks),
+        trace=trace,
+        sample=_add_samples(parts),
+        base_draws=sum(part.outcome.base_draws for part in parts),
+        no_outcome_share=min(sum(part.of_sum * part.outcome.no_outcome_share for part in found), 1.0),
+        draw_weights=tuple(
+            replace(weights, log_share=weights.log_share + math.log(part.share))
+            for part in simulated
+            for weights in part.outcome.draw_weights
+            if known
+        ),
+        parts=parts,
+    )
+
+
+def dilute(found: Outcome, nothing: Outcome, share: float) -> Outcome:
+    """Return the mean of a run with this share and of one that met no failure."""
+    low, high = found.interval
+    return replace(
+        found,
+        p=share * found.p,
+        interval=(share * low, max(share * high, nothing.interval[1])),
+        sample=_merge_samples([found, nothing], [share, 1 - share]),
+        base_draws=found.base_draws + nothing.base_draws,
+        draw_weights=tuple(replace(each, log_share=each.log_share + math.log(share)) for each in found.draw_weights),
+    )
+
+
+def _add_samples(parts: Sequence[Part]) -> Sample | None:
+    """Return the points of all strata, weighted under the whole base; None if a stratum has none to give.
+
+    The share that searches may have missed is that of each stratum, weighted by its share of the sum: about 0.1 / nu.
+    """
+    whole = _merge_samples([part.outcome for part in parts], [part.share for part in parts])
+    if whole is None:
+        return None
+    missed = sum(part.of_sum / s.lineages for part in parts if part.p > 0 and (s := part.outcome.sample) is not None)
+    return replace(whole, lineages=1 / missed if missed > 0 else math.inf)

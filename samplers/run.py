@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.reweight import check_refits
-from samplers.combination import combine
 from samplers.method import Answer, Choice, Goal, Outcome, Request, Stepping, TermsOffer, choose_method
 from samplers.problem import (
     ON_ERROR,
@@ -27,11 +26,20 @@ from samplers.problem import (
     describe_point,
     names_of_columns,
     one_per_row,
+    read_strata,
 )
-from samplers.replicate import InputsOnly, Replicate, count_simulations, meets_target, needs_another, outcomes_of
+from samplers.replicate import (
+    InputsOnly,
+    Replicate,
+    combine,
+    count_simulations,
+    meets_target,
+    needs_another,
+    outcomes_of,
+)
 from samplers.result import Estimate
 from samplers.sample import Failures, Interval, SimulatedPoints, Status, gain_over_monte_carlo
-from samplers.strata import SumOfStrata, read_strata
+from samplers.strata import SumOfStrata
 
 MOST_SIMULATIONS = 10**12
 """Largest `max_sim`: more is a slip of the keyboard."""

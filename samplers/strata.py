@@ -27,18 +27,27 @@ References:
 """
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.combination import UNINFORMATIVE_COV, combine, dilute, pool_counts, sum_strata
 from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, choose_method, offer_of
 from samplers.plain_draws import PlainDraws
-from samplers.problem import Distribution, FloatArray, Inputs
-from samplers.replicate import NOT_KNOWN, InputsOnly, Replicate, needs_another
+from samplers.problem import FloatArray, Inputs
+from samplers.replicate import (
+    NOT_KNOWN,
+    UNINFORMATIVE_COV,
+    InputsOnly,
+    Replicate,
+    combine,
+    dilute,
+    needs_another,
+    pool_counts,
+    sum_strata,
+)
 from samplers.sample import Level, Status, zero_hit_bound
 
 PILOT_SHARE = 0.25
@@ -59,31 +68,6 @@ PLENTY = 6000
 """Simulations for a stratum in which nothing fails; further ones are plain draws, which all count in its upper end."""
 LEAST_GAIN = 0.1
 """Plain draws are made where they are more than this part of the simulations made."""
-SHARE_ROUNDING = 1e-6
-"""Shares add up to 1 within this."""
-
-
-def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
-    """Raise a ValueError unless strata have different names and shares above 0 that add up to 1."""
-    if len(set(names)) < len(names) or not all(isinstance(name, str) and name for name in names):
-        raise ValueError(f"Expected strata with different names, got {', '.join(map(repr, names))}.")
-    if not all(share > 0 for share in shares) or abs(math.fsum(shares) - 1) > SHARE_ROUNDING:
-        given = " + ".join(f"{share:.6g}" for share in shares)
-        raise ValueError(f"Expected shares of strata above 0 that add up to 1, got {given} = {math.fsum(shares):.6g}.")
-
-
-def read_strata(base: Any) -> tuple[Any, ...]:
-    """Return the strata of a base distribution (see `samplers.Distribution`), none where it has fewer than two.
-
-    Raises:
-        ValueError: If names, shares or bases do not fit.
-    """
-    strata = tuple(getattr(base, "strata", None) or ())  # a base distribution need not have it
-    check_shares([stratum.name for stratum in strata], [stratum.share for stratum in strata] or [1.0])
-    for stratum in strata:
-        if not isinstance(stratum.base, Distribution):
-            raise ValueError(f"Expected a base distribution of stratum {stratum.name!r}, got {stratum.base!r}.")
-    return strata if len(strata) > 1 else ()
 
 
 @dataclass(frozen=True)

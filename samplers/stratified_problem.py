@@ -15,9 +15,8 @@ from scipy.special import ndtr, ndtri
 from samplers.analysis.reweight import FittedBase, find_fitted_base
 from samplers.distributions import LOG_TWO_PI, DrawnByItsMap
 from samplers.evaluate import find_chunk_size
-from samplers.problem import FloatArray, Problem, check_number, names_of_columns, one_per_row
+from samplers.problem import FloatArray, Problem, check_number, check_shares, names_of_columns, one_per_row
 from samplers.run import check_problem
-from samplers.strata import check_shares
 
 N_REFITS = 100
 """Refits of shares: enough for a spread that is not a matter of chance."""

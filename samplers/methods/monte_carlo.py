@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from samplers.methods.base import Method
 from samplers.plain_draws import PlainDraws
-from samplers.problem import check_settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +28,3 @@ class MonteCarlo(PlainDraws, Method):
         >>> result.interval[0] < 0.02275 < result.interval[1], result.cov < 0.07
         (True, True)
     """
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        check_settings(self, n=1, batch=1)

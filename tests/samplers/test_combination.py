@@ -6,9 +6,9 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.combination import combine, combined_cov
 from samplers.limit_states import half_space
 from samplers.method import Outcome
+from samplers.replicate import combine, combined_cov
 from samplers.sample import Sample, Status, binomial_cov, clopper_pearson
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.combination import combine
 from samplers.estimation import EstimationInterrupted, defer_signals, show_bar
 from samplers.limit_states import half_space
 from samplers.method import Answer, Goal, Outcome
 from samplers.problem import EvaluationError, FloatArray
+from samplers.replicate import combine
 from samplers.run import Progress, Run, RunArguments
 from samplers.sample import Status, binomial_cov, clopper_pearson
 

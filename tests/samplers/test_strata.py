@@ -12,12 +12,11 @@ from scipy.stats import norm
 
 import samplers
 from samplers import FunctionProblem, StratifiedProblem, Stratum
-from samplers.combination import sum_strata
 from samplers.method import Outcome, Part
-from samplers.problem import StandardNormal
+from samplers.problem import StandardNormal, read_strata
 from samplers.proposals import Gaussian
+from samplers.replicate import sum_strata
 from samplers.sample import Status, bound_missed
-from samplers.strata import read_strata
 from samplers.testing import check_base
 
 
