@@ -18,12 +18,14 @@ from torch import nn
 import rare_envs
 from agents import load_ego
 from agents.onnx import ACTION_TOLERANCE, compare_actions, export_onnx
+from rare_envs.simulation.observation import count_features
 from tests.agents.sb3.test_saved_ego import Still
 
 pytest.importorskip("onnx", reason="the extra onnx is optional")
 pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
 ENV = "rare_envs/CarFollowing-v0"
+COLUMNS = count_features(2)
 
 
 def vec_env(action_space: spaces.Space[Any] | None = None) -> DummyVecEnv:
@@ -101,7 +103,7 @@ def write(module: nn.Module, path: Path, batch: int = 1, dynamic: bool = True) -
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         axes = {"obs": {0: "n"}} if dynamic else None
-        example = torch.zeros(batch, 7)
+        example = torch.zeros(batch, COLUMNS)
         torch.onnx.export(module, (example,), str(path), input_names=["obs"], dynamic_axes=axes, dynamo=False)
     return path
 
@@ -109,10 +111,10 @@ def write(module: nn.Module, path: Path, batch: int = 1, dynamic: bool = True) -
 @pytest.mark.parametrize("fixed", [None, 3])
 def test_a_network_of_plain_pytorch_drives(fixed: int | None, tmp_path: Path) -> None:
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(7, 16), nn.Tanh(), nn.Linear(16, 2)).requires_grad_(False)
+    network = nn.Sequential(nn.Linear(COLUMNS, 16), nn.Tanh(), nn.Linear(16, 2)).requires_grad_(False)
     ego = load_ego(write(network, tmp_path / "ego.onnx", batch=fixed or 1, dynamic=fixed is None))
     assert ego.fixed_batch == fixed
-    observation = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
+    observation = np.random.default_rng(0).normal(size=(5, COLUMNS)).astype(np.float32)
     np.testing.assert_allclose(ego.predict(observation)[0], network(torch.from_numpy(observation)), atol=1e-6)
 
     class Same:
@@ -125,10 +127,10 @@ def test_a_network_of_plain_pytorch_drives(fixed: int | None, tmp_path: Path) ->
 
 
 def test_the_best_of_five_scores_is_the_action(tmp_path: Path) -> None:
-    network = nn.Linear(7, 5).requires_grad_(False)
+    network = nn.Linear(COLUMNS, 5).requires_grad_(False)
     ego = load_ego(write(network, tmp_path / "ego.onnx"))
     assert ego.action_space == spaces.Discrete(5)
-    observation = np.random.default_rng(0).normal(size=(20, 7)).astype(np.float32)
+    observation = np.random.default_rng(0).normal(size=(20, COLUMNS)).astype(np.float32)
     expected = network(torch.from_numpy(observation)).argmax(dim=1)
     np.testing.assert_array_equal(ego.predict(observation)[0], expected)
 

@@ -19,6 +19,7 @@ import rare_envs
 from agents import SavedEgo, load_ego
 from agents.saved_ego import describe_missing_statistics, find_statistics
 from rare_envs.egos.needs import EgoWarning
+from rare_envs.simulation.observation import count_features
 
 ENV = "rare_envs/CarFollowing-v0"
 SETTINGS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
@@ -47,7 +48,7 @@ def test_observations_are_normalised_once(normalised: tuple[Path, Path], tmp_pat
         plain = drive(load(tmp_path / "ego.zip"))
     shutil.copy(statistics, tmp_path / "vecnormalize.pkl")
     ego = load(tmp_path / "ego.zip")
-    seen = np.full((2, 7), 3.0, np.float32)
+    seen = np.full((2, *ego.policy.observation_space.shape), 3.0, np.float32)
     expected = ego.policy.predict(ego.statistics.normalize_obs(seen), deterministic=True)[0]
     np.testing.assert_array_equal(ego.predict(seen)[0], expected)
     np.testing.assert_array_equal(seen, 3.0)
@@ -115,14 +116,15 @@ def test_the_scale_of_the_last_observations_tells() -> None:
     assert "reach" in describe_missing_statistics({}, rows * 4, box, box)
 
 
+COLUMNS = count_features(2)
 DAMAGES: dict[str, dict[str, Any]] = {
     "no moments": {"obs_rms": None},
     "no bound": {"clip_obs": None},
     "text for moments": {"obs_rms": "text"},
     "text for a space": {"observation_space": "Box"},
     "mean of another shape": {"mean": np.zeros(3)},
-    "negative variance": {"var": np.full(7, -1.0)},
-    "variance is NaN": {"var": np.full(7, np.nan)},
+    "negative variance": {"var": np.full(COLUMNS, -1.0)},
+    "variance is NaN": {"var": np.full(COLUMNS, np.nan)},
 }
 """What is put into statistics, or into their moments."""
 

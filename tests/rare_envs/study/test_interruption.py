@@ -144,7 +144,8 @@ def test_a_risk_says_what_was_done_before(cli: Cli, here: Path, monkeypatch: pyt
     monkeypatch.setattr(total_risk, "run", stop_in_the_second)
     result = cli(*words)
     assert result.exit_code == 143
-    assert f"\n{NOTHING} Done before: cut-in 0.26 per km x " in result.stderr
+    assert "P[f <= 0] = 4.87e-01" in result.stderr  # at 0.26 cut-ins per km
+    assert f"\n{NOTHING} Done before: cut_in 130,000 per million km." in result.stderr
 
 
 def test_a_full_disk_in_mid_run_counts_each_simulation_once(
