@@ -20,8 +20,8 @@ import samplers
 from agents import load_ego
 from benchmarks import RESULTS
 from rare_envs.startup import use_one_thread
+from samplers.problem import read_strata
 from samplers.sample import clopper_pearson
-from samplers.strata import read_strata
 
 ROADS_RESULT = RESULTS / "roads.json"
 ENVS = ("rare_envs/CutIn-v1", "rare_envs/HardBrake-v0")
