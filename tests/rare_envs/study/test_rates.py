@@ -294,16 +294,16 @@ class Policy:
 
 def test_the_scenarios_that_a_policy_fits_are_run(bases: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """With hard brake among five vehicles, for which the policy has not enough inputs."""
-    found = rare_envs.risk(Policy(), bases=bases, **FEW)
+    found = rare_envs.risk(Policy(), bases=bases, method="mc", max_sim=40)
     assert not found.left_out and len(found.scenarios) == 2
     crowded = replace(HARD_BRAKE, vehicle_names=("ego", "lead", "a", "b", "c"), labels=())
     monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", crowded)
-    found = rare_envs.risk(Policy(), bases=bases, **FEW)
+    found = rare_envs.risk(Policy(), bases=bases, method="mc", max_sim=40)
     assert [each.name for each in found.scenarios] == ["cut_in"] and list(found.left_out) == ["hard_brake"]
     [warning] = [each for each in found.warnings if "left out" in each]
     assert warning.startswith("hard brake is left out: The ego expects observations") and "(19,)" in warning
     stranger = Policy()
     stranger.observation_space = spaces.Box(-1.0, 1.0, (101,))
     with pytest.raises(BadInput, match=r"fits none of the scenarios cut-in, hard brake\. .*101") as refused:
-        rare_envs.risk(stranger, bases=bases, **FEW)
+        rare_envs.risk(stranger, bases=bases, method="mc", max_sim=40)
     assert "\n" not in str(refused.value)
