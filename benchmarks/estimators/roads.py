@@ -29,6 +29,8 @@ METHODS = ("mc", "two-stage", "adss", "auto")
 PLAIN = "plain draws"
 """Name of the rows without a sampler."""
 CHUNK = 50_000
+USUAL_BUDGET = 20_000
+"""Simulations of a run; rows of runs with others have them in the name of the method."""
 
 
 class StratumRow(NamedTuple):
@@ -74,8 +76,9 @@ def run_method(problem: rare_envs.DrivingProblem, ego: str, method: str, seed: i
     for part in found.parts:
         gain = None if part.p == 0 else (1.0 - part.p) / part.p / (part.n_sim * part.cov**2)
         doubts = sum(each.startswith(part.name) for each in (*found.warnings, *found.remarks))
+        name = method if most == USUAL_BUDGET else f"{method}, max_sim {most}"
         cells = part.p, *part.interval, part.n_sim, gain, part.method, doubts
-        yield StratumRow(problem.env_id, ego, part.name, method, seed, *cells)
+        yield StratumRow(problem.env_id, ego, part.name, name, seed, *cells)
 
 
 def find_disagreements(rows: list[StratumRow]) -> list[str]:
@@ -108,7 +111,7 @@ def main(
     env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
     method: Annotated[str, typer.Option(help="With commas between.")] = ",".join(METHODS),
     seeds: int = 3,
-    max_sim: Annotated[int, typer.Option(help="Simulations of a run.")] = 20_000,
+    max_sim: Annotated[int, typer.Option(help="Simulations of a run.")] = USUAL_BUDGET,
     draws: Annotated[int, typer.Option(help="Plain draws of each stratum; 0 keeps those that were made.")] = 1_000_000,
     slow_draws: Annotated[int, typer.Option(help="The same where rollouts are not compiled.")] = 200_000,
 ) -> None:
@@ -116,16 +119,18 @@ def main(
     command = "python -m benchmarks.estimators.roads --ego idm,human,runs/demo/ego.zip"
     for name in ego.split(","):
         for env_id in (each for each in ENVS if env in each):
-            problem, rows = make_problem(env_id, name), list[StratumRow]()
-            if draws:
-                most = draws if problem.core == "numba" else slow_draws
-                rows += draw_plain(problem, name, most, 0)
-            for each in method.split(",") if method else ():
-                rows += (row for seed in range(seeds) for row in run_method(problem, name, each, seed, max_sim))
-            for row in rows:
-                gain = "" if row.gain is None else f"{row.gain:.3g}"
-                print(*row[:5], f"{row.p:.2e} {row.low:.2e} {row.high:.2e}", row.n_sim, gain, row.by, row.doubts)
-            write(rows, command)
+            problem = make_problem(env_id, name)
+            most = draws if problem.core == "numba" else min(draws, slow_draws)
+            jobs = [draw_plain(problem, name, most, 0)] if draws else []
+            asked = method.split(",") if method else ()
+            jobs += [run_method(problem, name, each, seed, max_sim) for each in asked for seed in range(seeds)]
+            for job in jobs:
+                rows = list(job)
+                for row in rows:
+                    gain = "" if row.gain is None else f"{row.gain:.3g}"
+                    ends = f"{row.p:.2e} {row.low:.2e} {row.high:.2e}"
+                    print(*row[:5], ends, row.n_sim, gain, row.by, row.doubts, flush=True)
+                write(rows, command)
 
 
 if __name__ == "__main__":
