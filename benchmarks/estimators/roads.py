@@ -5,10 +5,13 @@
 asks two-stage, adaptive subset simulation, plain Monte Carlo and the default about each ego in `CutIn-v1` and
 `HardBrake-v0`, and draws every stratum by itself without a sampler. benchmarks/results/roads.json has p, interval and
 gain of each run and stratum, and which intervals do not meet that of the plain draws. Cells that are asked for again
-are replaced, all others stay.
+are replaced, all others stay. What too few simulations give in a stratum with many failure regions:
+
+    python -m benchmarks.estimators.roads --ego idm --env CutIn --method two-stage,auto --max-sim 8000 --seeds 5
 """
 
 import json
+import sys
 from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
@@ -94,12 +97,13 @@ def find_disagreements(rows: list[StratumRow]) -> list[str]:
 
 
 def write(rows: list[StratumRow], command: str) -> None:
-    """Write rows and disagreements; rows of other cells stay."""
-    cells = json.loads(ROADS_RESULT.read_text())["rows"] if ROADS_RESULT.exists() else []
+    """Write rows, disagreements and the commands that all rows are of; rows of other cells stay."""
+    old = json.loads(ROADS_RESULT.read_text()) if ROADS_RESULT.exists() else {"commands": [], "rows": []}
+    cells, commands = old["rows"], sorted({*old["commands"], command})
     kept = {row[:5]: row for row in (*(StratumRow(**cell) for cell in cells), *rows)}
     rows = sorted(kept.values())
     versions = {"rare_envs": rare_envs.__version__, "numpy": np.__version__}
-    about: dict[str, Any] = {"command": command, "versions": versions, "disagreements": find_disagreements(rows)}
+    about: dict[str, Any] = {"commands": commands, "versions": versions, "disagreements": find_disagreements(rows)}
     lines = ",\n".join(f"  {json.dumps(row._asdict())}" for row in rows)
     head = json.dumps(about, indent=1).removesuffix("\n}")
     ROADS_RESULT.write_text(f'{head},\n "rows": [\n{lines}\n ]\n}}\n')
@@ -116,7 +120,7 @@ def main(
     slow_draws: Annotated[int, typer.Option(help="The same where rollouts are not compiled.")] = 200_000,
 ) -> None:
     """Ask every method, print what came out, and write it."""
-    command = "python -m benchmarks.estimators.roads --ego idm,human,runs/demo/ego.zip"
+    command = f"python -m benchmarks.estimators.roads {' '.join(sys.argv[1:])}".strip()
     for name in ego.split(","):
         for env_id in (each for each in ENVS if env in each):
             problem = make_problem(env_id, name)
