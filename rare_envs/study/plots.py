@@ -114,18 +114,21 @@ def explain_no_failure(report: Report) -> str:
 
 
 def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
-    """Draw the estimate against the simulations spent, level by level, and the interval at the end."""
+    """Draw the estimate against the simulations spent, level by level, and its interval; of a sum the parts."""
     trace, gamma, p = result.get("trace") or [], float(result["gamma"]), float(result["p"])
     low, high = (float(end) for end in result["interval"])
-    runs = sorted({level["run"] for level in trace})
+    shares = {part["name"]: part["share"] for part in result.get("parts") or []}
+    runs = sorted({(level["run"], level.get("stratum") or "") for level in trace})
     by_levels = any(level["gamma"] != gamma for level in trace)
     seen: list[float] = []
     for run in runs:
-        levels = [level for level in trace if level["run"] == run]
+        levels = [level for level in trace if (level["run"], level.get("stratum") or "") == run]
         spent = np.cumsum([level["n_sim"] for level in levels])
-        values = np.array([level["estimate"] or np.nan for level in levels])
+        values = shares.get(run[1], 1.0) * np.array([level["estimate"] or np.nan for level in levels])
         seen += [value for value in values if value > 0]
-        axes.plot(spent, values, "o-", color=LINE_COLOUR, alpha=max(0.25, 1 / len(runs)), markersize=4)
+        (line,) = axes.plot(spent, values, "o-", color=LINE_COLOUR, alpha=max(0.25, 1 / len(runs)), markersize=4)
+        if run[1]:
+            line.set(color=f"C{list(shares).index(run[1]) + 1}", label=run[1], alpha=0.8)
         gammas, cov = (np.array([level[name] for level in levels], dtype=float) for name in ("gamma", "cov"))
         if len(runs) == 1 and by_levels:  # each threshold that differs from the one before
             for i in np.flatnonzero(np.isfinite(values) & (np.diff(gammas, prepend=np.nan) != 0)):
@@ -153,7 +156,8 @@ def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
         least, most = min(*seen, max(low, high / 30)), max(*seen, high)
         axes.set_ylim(least / 1.5, min(most * 1.5, 1.5))
     axes.set_xlim(left=0)
-    axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each of {len(runs)} runs")
+    each = "stratum" if shares else f"of {len(runs)} runs"
+    axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each {each}")
     axes.set_ylabel("P[f ≤ threshold of the level]" if by_levels else f"P[f ≤ {gamma:g}]")
     way = "From ordinary traffic to the failures, level by level" if by_levels else "The estimate, batch by batch"
     axes.set_title(way, fontsize=10)
