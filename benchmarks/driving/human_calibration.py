@@ -322,7 +322,7 @@ OUTCOMES: tuple[Outcome, Outcome] = ("contacts", "near_crashes")
 def show(p: ModelCount, scale: float = 1.0, digits: str = ".1e") -> str:
     """Return a probability, or a rate by its scale, with its interval."""
     low, high = scale * p.low, scale * p.high
-    return f"{scale * p.p:{digits}} ({low:{digits}} to {high:{digits}})" if p.p > 0 else f"under {high:{digits}}"
+    return f"{scale * p.p:{digits}} [{low:{digits}},{high:{digits}}]" if p.p > 0 else f"<{high:{digits}}"
 
 
 def people_count(each: EventCalibration, outcome: Outcome) -> ModelCount:
@@ -351,17 +351,23 @@ def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[st
     return lines
 
 
-def format_cells(cells: Sequence[CalibrationCell], title: str) -> list[str]:
-    """Return the table of single strata."""
-    names = "change", "draws", "contacts", "flanks", "near-crashes: the ego's", "the cutter's", "rapid, not needed"
-    lines = [title, "", f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
-    for c in cells:
-        flank = f"{c.flanks / c.contacts:.0%}" if c.contacts else ""
-        counts = [show(c.probability(c.contacts)), flank, show(c.probability(c.counter))]
-        counts += [show(c.probability(c.evaded)) if c.stratum == "unseen" else "", f"{c.rapid / c.draws:.1e}"]
-        what = STRATA[c.stratum].words + ("" if c.change else f", {c.site}, {c.ego}")
-        lines.append(f"| {what} | {c.change} | {c.draws:,} | {' | '.join(counts)} |")
+def format_changes(cells: Sequence[CalibrationCell], title: str) -> list[str]:
+    """Return the table of contacts / near-crashes by part taken away and stratum."""
+    lines = [title, "", f"| contacts / near-crashes | {' | '.join(each.words for each in STRATA.values())} |"]
+    lines.append("|---" * (len(STRATA) + 1) + "|")
+    found = {(cell.change, cell.stratum): cell for cell in cells}
+    for change in dict.fromkeys(cell.change for cell in cells):
+        row = [found.get((change, name)) for name in STRATA]
+        texts = [
+            "" if c is None else "/".join(_show_count(n, c.draws) for n in (c.contacts, c.near_crashes)) for c in row
+        ]
+        lines.append(f"| {change or 'as it is'} | {' | '.join(texts)} |")
     return [*lines, ""]
+
+
+def _show_count(count: int, draws: int) -> str:
+    """Return a share of draws; 0 where there is none."""
+    return f"{count / draws:.1e}" if count else "0"
 
 
 def describe_factor(factor: float) -> str:
@@ -369,6 +375,15 @@ def describe_factor(factor: float) -> str:
     if factor == 1.0:
         return "inside people's interval"
     return f"{factor:.1f} times its upper end" if factor > 1.0 else f"{1.0 / factor:.1f} times below its lower end"
+
+
+def _list_factors(found: Mapping[Event, EventCalibration]) -> list[str]:
+    """Return by how much `human` misses people, event by event."""
+    return [
+        f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]} {describe_factor(each.factor(outcome))}"
+        for event, each in found.items()
+        for outcome in OUTCOMES
+    ]
 
 
 def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCell], site: str) -> list[str]:
@@ -413,13 +428,13 @@ def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCe
 def format_measured(cells: Sequence[CalibrationCell], sites: Sequence[str], command: str) -> str:
     """Return the measured part of the page."""
     lines = [MEASURED, "", f"`{command}`; intervals of 95 %, of sampling and of people's counts alone.", ""]
-    for site in sites:
-        lines += format_events(calibrate(cells, site), site)
     first = sites[0]
+    lines += format_events(calibrate(cells, first), first)
     lines += ["### Targets", "", *(f"* {each}" for each in judge(calibrate(cells, first), cells, first)), ""]
-    plain = [c for c in cells if not c.change]
-    lines += format_cells(plain, "### By stratum")
-    lines += format_cells([c for c in cells if c.change], f"### Parts taken away one at a time, `human` on {first}")
+    for site in sites[1:]:
+        lines += [f"At {site}, of which nothing was chosen: {'; '.join(_list_factors(calibrate(cells, site)))}.", ""]
+    of_human = [c for c in cells if (c.site, c.ego) == (first, HUMAN)]
+    lines += format_changes(of_human, f"### Parts taken away one at a time, `human` on {first}")
     return "\n".join(lines).rstrip() + "\n"
 
 
