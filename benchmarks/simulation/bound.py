@@ -22,7 +22,7 @@ from rare_envs.fast.networks import activate
 SIMPLE = frozenset(
     "add sub rsub mul neg abs sign square relu lerp addcmul where masked_fill clamp clamp_min clamp_max minimum "
     "maximum round floor ceil trunc eq ne lt le gt ge isfinite isnan nan_to_num logical_and logical_or logical_not "
-    "bitwise_and bitwise_or bitwise_not __and__ __or__ __lshift__ __rshift__".split()
+    "isneginf bitwise_and bitwise_or bitwise_not __and__ __or__ __lshift__ __rshift__".split()
 )
 """Sums, products, comparisons, choices."""
 REDUCTIONS = frozenset(
@@ -32,7 +32,7 @@ REDUCTIONS = frozenset(
 ROOTS = frozenset("div sqrt rsqrt reciprocal remainder fmod floor_divide hypot linalg_vector_norm".split())
 CURVES = frozenset(
     "sin cos tan asin acos atan atan2 arctan2 sinh cosh tanh exp expm1 log log1p pow sigmoid softplus softmax "
-    "special_log_ndtr".split()
+    "special_log_ndtr special_ndtr".split()
 )
 PRODUCTS = {"mm": 0, "bmm": 0, "matmul": 0, "linear": 0, "addmm": 1, "baddbmm": 1}
 """Products of matrices, with the place of their first factor."""
