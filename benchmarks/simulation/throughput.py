@@ -160,6 +160,7 @@ def _drive_by_policy(model: Any, x: np.ndarray[Any, Any]) -> None:
         relative_speed = lead.speed * np.cos(lead.heading) - ego.speed * np.cos(ego.heading)
         features = [ego.speed / 30, y_ego / 4, ego.heading / 0.1, (x_lead - x_ego - 5) / 50, relative_speed / 10]
         features += [(y_lead - y_ego) / 4, lead.speed * np.sin(lead.heading) / 2]
+        features += [5.0, 0.0, 0.0, 0.0]  # where a second vehicle would be: far ahead, as fast
         action, _ = model.predict(np.clip(np.array(features, np.float32), -5, 5), deterministic=True)
         road.act()
         ego.act({"acceleration": 5.0 * float(action[0]), "steering": 0.1 * float(action[1])})
