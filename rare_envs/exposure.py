@@ -640,10 +640,11 @@ def calibration() -> Mapping[Event, EventCalibration]:
         ['cut_in', 'slowing', 'stop']
     """
     content = json.loads((resources.files("rare_envs") / "data" / "human_calibration.json").read_text("utf-8"))
+    of = {event: next(iter(bases.items())) for event, bases in content["events"].items()}
     return {
         event: EventCalibration(
             event=event,
-            base=found["base"],
+            base=base,
             per_km=found["per_km"],
             drivers={
                 driver: {outcome: ModelCount(*count) for outcome, count in counts.items()}
@@ -651,5 +652,5 @@ def calibration() -> Mapping[Event, EventCalibration]:
             },
             provisional=content["provisional"],
         )
-        for event, found in content["events"].items()
+        for event, (base, found) in of.items()
     }

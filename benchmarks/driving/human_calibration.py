@@ -297,19 +297,16 @@ def calibrate(cells: Sequence[CalibrationCell], site: str) -> dict[Event, EventC
     return found
 
 
-def to_package(found: Mapping[Event, EventCalibration], command: str) -> dict[str, Any]:
-    """Return what `rare_envs.exposure.calibration` reads: the bracket alone."""
-    events = {
-        event: {
-            "base": each.base,
-            "per_km": each.per_km,
-            "drivers": {
+def to_package(cells: Sequence[CalibrationCell], sites: Sequence[str], command: str) -> dict[str, Any]:
+    """Return what `rare_envs.exposure.calibration` reads, by event and base: the bracket alone."""
+    events: dict[Event, dict[str, Any]] = {event: {} for event in EVENT_WORDS}
+    for site in sites:
+        for event, each in calibrate(cells, site).items():
+            counts = {
                 ego: {outcome: [float(f"{value:.3g}") for value in of] for outcome, of in each.drivers[ego].items()}
                 for ego in (HUMAN, BRACKET)
-            },
-        }
-        for event, each in found.items()
-    }
+            }
+            events[event][site] = {"per_km": each.per_km, "drivers": counts}
     return {"provisional": False, "command": command, "events": events}
 
 
@@ -452,25 +449,29 @@ def main(
     changes: Annotated[bool, typer.Option(help="Whether to take parts away.")] = True,
     workers: int = 2,
     seed: int = 0,
+    drive: Annotated[bool, typer.Option(help="Whether to drive; the cells of the last run are taken else.")] = True,
     write: Annotated[bool, typer.Option(help="Whether to write both files and the page.")] = True,
 ) -> None:
     """Measure, compare with people, and write."""
     sites, egos = site or ["us101", "i80"], only or [*EGOS, *(ego or [])]
-    cells = []
-    for cell in count(plan(sites, draws, egos, changes), seed, workers):
-        cells.append(cell)
-        print(cell, flush=True)
     options = {"draws": [str(draws)], "site": site or [], "ego": ego or [], "only": only or [], "seed": [str(seed)]}
     given = "".join(f" --{name} {value}" for name, values in options.items() for value in values)
     command = f"python -m benchmarks.driving.human_calibration{given}"
+    if drive:
+        cells = []
+        for cell in count(plan(sites, draws, egos, changes), seed, workers):
+            cells.append(cell)
+            print(cell, flush=True)
+        about = {"command": command, "version": rare_envs.__version__, "model": asdict(HUMAN_EGOS[HUMAN].model)}
+    else:
+        about = json.loads(CALIBRATION_RESULT.read_text(encoding="utf-8"))
+        cells, command = [CalibrationCell(**each) for each in about["cells"]], about["command"]
     measured = format_measured(cells, sites, command)
     print(measured)
     if write:
-        found = calibrate(cells, sites[0])
-        about = {"command": command, "version": rare_envs.__version__, "model": asdict(HUMAN_EGOS[HUMAN].model)}
-        told = {"verdicts": judge(found, cells, sites[0]), "cells": [asdict(cell) for cell in cells]}
+        told = {"verdicts": judge(calibrate(cells, sites[0]), cells, sites[0]), "cells": [asdict(c) for c in cells]}
         CALIBRATION_RESULT.write_text(json.dumps({**about, **told}, indent=1) + "\n", encoding="utf-8")
-        package = json.dumps(to_package(found, command), indent=1)
+        package = json.dumps(to_package(cells, sites, command), indent=1)
         CALIBRATION_OF_PACKAGE.write_text(package + "\n", encoding="utf-8")
         write_page(measured)
 

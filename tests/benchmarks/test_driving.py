@@ -103,7 +103,7 @@ def test_strata_are_added_by_their_shares_and_compared_with_people(monkeypatch) 
         assert found["stop"].factor() == pytest.approx(factor, rel=0.02)
         (told,) = [each for each in judge(found, cells, "us101") if each.startswith("contacts per lead that stops")]
         assert f"**{word}**" in told
-        read = to_package(found, "")["events"]["stop"]
+        read = to_package(cells, ["us101"], "")["events"]["stop"]["us101"]
         assert read["drivers"][HUMAN]["contacts"][0] == pytest.approx(contacts / 1e6, rel=0.01)
     cut_ins = found["cut_in"].drivers[HUMAN]
     assert cut_ins["contacts"].p == pytest.approx(1e-5 + 1e-4 * 1e-2, rel=1e-3)
