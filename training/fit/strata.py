@@ -6,7 +6,7 @@ near-crashes of 3.219e6 km were lane changes of drivers who had not seen the oth
 
     share = 44 / (3.219e6 km * cut-ins per km * P[near-crash | not looked]).
 
-P was simulated: 0.38 in the traffic of US 101, 0.53 in that of I-80. The logarithm of the share has a standard
+P was simulated: 0.321 in the traffic of US 101, 0.429 in that of I-80. The logarithm of the share has a standard
 deviation of 0.74: 44 events 0.15, traffic of the study thinner by up to 2.7 log(2.7) / 2, changes per km by a factor
 of 2 log(2) / 2, and how soon drivers notice 0.4. A refit draws a share anew.
 
@@ -52,8 +52,9 @@ ATTITUDES = 6
 """Columns behind the seven of a start: standard normals, of which attention is the first."""
 UNSEEN_EVENTS, UNSEEN_KM = 44, 3.219e6
 """Near-crashes of the 100-Car study at lane changes of subjects who did not see the other vehicle, and its km."""
-NEAR_IF_UNSEEN = {"us101": 0.38, "i80": 0.53}
-"""Share of changes without a look that are near-crashes, simulated with the human driver; US 101's is the usual one."""
+NEAR_IF_UNSEEN = {"us101": 0.321, "i80": 0.429}
+"""Share of changes without a look that are near-crashes, of 200,000 draws of the stratum with `human` (+- 0.001); US
+101's is the usual one."""
 UNSEEN_LOG_SD = math.sqrt(1.0 / UNSEEN_EVENTS + (math.log(2.7) / 2) ** 2 + (math.log(2.0) / 2) ** 2 + 0.4**2)
 """Of the share of those who do not look: see above."""
 UNSEEN_COMPONENTS, UNSEEN_STARTS = 3, 2
@@ -111,8 +112,8 @@ def share_unseen(per_km: float, near: float) -> float:
     """Return the share of cutters who do not look, of cut-ins per km and the share of theirs that are near-crashes.
 
     Example:
-        >>> f"{share_unseen(0.26, 0.38):.1e}"
-        '1.4e-04'
+        >>> f"{share_unseen(0.26, 0.321):.1e}"
+        '1.6e-04'
     """
     return UNSEEN_EVENTS / (UNSEEN_KM * per_km * near)
 
