@@ -1,4 +1,4 @@
-"""Exposure: from a probability per event to collisions per hour and per kilometre, beside those of human drivers.
+"""Exposure: from a probability per event to collisions per hour and per kilometre.
 
 With lambda the frequency of the events and p the probability that one of them ends in a collision, the rate is
 R = lambda p. Both factors are wide, so that errors add up in logarithms:
@@ -20,40 +20,23 @@ and in the same way upwards. For an interval p exp(-+ t S) that is the formula a
 Rates of several scenarios are added, with their variances, not their logarithms. As they are wide and skewed, the
 interval is that of the sum of draws from each. Scenarios whose bases were fitted to the same events share that error. A
 scenario whose p is not determined (nothing failed, or its events do not determine p) raises the upper end alone.
-
-A simulated collision is a contact at any speed. What to compare it with are the contacts of naturalistic studies, seen
-on video, not crashes reported to the police, which are 7 to 10 times fewer.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import cache, cached_property
-from importlib import resources
-from typing import Any, Literal, NamedTuple, TypeAlias
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, gammaincinv, ndtri
+from scipy.special import ndtri
 
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import EventFrequency
 
-__all__ = [
-    "HUMAN_BENCHMARKS",
-    "CollisionProbability",
-    "CollisionRate",
-    "EventCalibration",
-    "HumanBenchmark",
-    "ModelCount",
-    "PeopleInEvent",
-    "TotalRate",
-    "VarianceShare",
-    "calibration",
-    "people_in",
-]
+__all__ = ["CollisionProbability", "CollisionRate", "TotalRate", "VarianceShare"]
 
 SOURCE_FIELDS = ("site", "date", "data", "licence")
 """Of a record: its entries, or those of its `source`."""
@@ -393,264 +376,3 @@ class TotalRate:
             drawn += rate.draw(exposure, groups[key], rng)
         low, high = np.quantile(drawn, tail_levels(self.confidence))
         return float(low), float(high) + above
-
-
-# --- human drivers ------------------------------------------------------------------------------
-
-KM_PER_MILE = 1.609344
-CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True, kw_only=True)
-class HumanBenchmark:
-    """Events of one kind that human drivers had in a study.
-
-    Example:
-        >>> low, high = CONTACTS_100CAR.interval_per_million_km
-        >>> f"{CONTACTS_100CAR.per_million_km:.0f} ({low:.0f} to {high:.0f}) {CONTACTS_100CAR.kind}"
-        '21 (16 to 27) contacts of all kinds'
-        >>> p, (low, high) = CUT_IN_CONTACTS_100CAR.per_event(0.26)  # cut-ins per km on US 101
-        >>> f"{p:.1e} ({low:.1e} to {high:.1e})"
-        '1.2e-06 (3.0e-08 to 6.7e-06)'
-    """
-
-    study: str
-    kind: str
-    """Kind of events, in the plural."""
-    count: int
-    miles: float
-    """Distance driven."""
-    hours: float | None
-    """Time driven; None where it is not given."""
-    source: str
-    words: str
-    """Words of the source, or how the count was made."""
-
-    @property
-    def per_million_km(self) -> float:
-        """Events per million kilometres."""
-        return 1e6 * self.count / (self.miles * KM_PER_MILE)
-
-    @property
-    def per_hour(self) -> float | None:
-        """Events per hour; None where the hours are not given."""
-        return None if self.hours is None else self.count / self.hours
-
-    @property
-    def interval_per_million_km(self) -> RateInterval:
-        """Exact Poisson interval of `per_million_km`, 95 %; the distance is taken as exact."""
-        tail = 0.5 - CONFIDENCE / 2
-        scale = 1e6 / (self.miles * KM_PER_MILE)
-        low = float(gammaincinv(self.count, tail)) if self.count else 0.0
-        return scale * low, scale * float(chdtri(2 * self.count + 2, tail)) / 2
-
-    def per_event(self, events_per_km: float) -> tuple[float, RateInterval]:
-        """Return the probability per event and its interval, of events that happen so often; their count is exact."""
-        scale = 1.0 / MILLION_KM / events_per_km
-        low, high = self.interval_per_million_km
-        return scale * self.per_million_km, (scale * low, scale * high)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        rates = {"per_million_km": self.per_million_km, "interval_per_million_km": list(self.interval_per_million_km)}
-        return {**asdict(self), **rates, "per_hour": self.per_hour}
-
-
-def _count_100car(kind: str, count: int, how: str) -> HumanBenchmark:
-    """Return a count of the 100-Car study; all of its roads, since its exposure by type of road is not known."""
-    return HumanBenchmark(
-        study="100-Car",
-        kind=kind,
-        count=count,
-        miles=2_000_000.0,
-        hours=43_000.0,
-        source="Virginia Tech Transportation Institute, Researcher Dictionary for Video Reduction Data 1.3, page 4",
-        words=f'"approximately 2,000,000 vehicles miles and 43,000 hours"; {how}, counted in the published table '
-        "of 828 events",
-    )
-
-
-def _count_shrp2(kind: str, count: int) -> HumanBenchmark:
-    return HumanBenchmark(
-        study="SHRP 2",
-        kind=kind,
-        count=count,
-        miles=34.5e6,
-        hours=None,
-        source="Kidd and McCartt 2015 (crashes); Ali, dissertation, Virginia Tech, 2023 (miles)",
-        words="\"Of 1,465 crashes ... 248 were severe ...; 597 were 'minor;' and 620 were 'low-risk tire strikes'\"; "
-        '"34.5 million miles"; the two from different papers',
-    )
-
-
-CONTACTS_100CAR = _count_100car("contacts of all kinds", 68, "68 crashes, every contact")
-REAR_END_CONTACTS_100CAR = _count_100car("contacts into a vehicle ahead", 14, "rear-end, striking: 14 crashes")
-REAR_END_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a vehicle ahead", 385, "rear-end, striking: 385")
-CUT_IN_CONTACTS_100CAR = _count_100car("contacts begun by another's lane change", 1, "1 crash, rear-end")
-CUT_IN_NEAR_CRASHES_100CAR = _count_100car(
-    "near-crashes begun by another's lane change", 136, "136 near-crashes: 74 rear-end, 58 sideswipe, 4 others"
-)
-_STOPPED = (
-    'rear-end, striking; precipitating event "other vehicle ahead - slowed and stopped 2 seconds or less" or '
-    '"stopped on roadway more than 2 seconds"'
-)
-_DECELERATING = 'rear-end, striking; precipitating event "other vehicle ahead - but decelerating"'
-STOP_CONTACTS_100CAR = _count_100car("contacts with a lead that stopped", 13, f"{_STOPPED}: 6 + 7 crashes")
-STOP_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a lead that stopped", 132, f"{_STOPPED}: 101 + 31")
-SLOWING_CONTACTS_100CAR = _count_100car("contacts with a lead that slowed", 0, f"{_DECELERATING}: no crash")
-SLOWING_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a lead that slowed", 152, f"{_DECELERATING}: 152")
-UNSEEN_CHANGES_100CAR = _count_100car(
-    "near-crashes in own lane changes into a vehicle that was not seen",
-    44,
-    '44 of the 74 near-crashes and 2 crashes in own lane changes: "did not see other vehicle during lane change"',
-)
-CONTACTS_SHRP2 = _count_shrp2("crashes without tyre strikes", 248 + 597)
-HUMAN_BENCHMARKS = (
-    CONTACTS_100CAR,
-    REAR_END_CONTACTS_100CAR,
-    CUT_IN_CONTACTS_100CAR,
-    STOP_CONTACTS_100CAR,
-    SLOWING_CONTACTS_100CAR,
-    _count_100car("near-crashes", 760, "760 near-crashes"),
-    REAR_END_NEAR_CRASHES_100CAR,
-    CUT_IN_NEAR_CRASHES_100CAR,
-    STOP_NEAR_CRASHES_100CAR,
-    SLOWING_NEAR_CRASHES_100CAR,
-    UNSEEN_CHANGES_100CAR,
-    CONTACTS_SHRP2,
-    _count_shrp2("severe crashes", 248),
-)
-"""All of them."""
-
-# --- by event: people, and the human driver model -----------------------------------------------
-
-Event: TypeAlias = Literal["cut_in", "stop", "slowing"]
-"""Another's lane change; a lead that brakes to a standstill; a lead that brakes without one."""
-Outcome: TypeAlias = Literal["contacts", "near_crashes"]
-
-
-class PeopleInEvent(NamedTuple):
-    """What people had in events of one kind.
-
-    Example:
-        >>> people = people_in("slowing")
-        >>> low, high = people.contacts.interval_per_million_km
-        >>> f"{people.contacts.count}, below {high:.1f} per million km; {people.near_crashes.count} near-crashes"
-        '0, below 1.1 per million km; 152 near-crashes'
-    """
-
-    contacts: HumanBenchmark
-    near_crashes: HumanBenchmark
-
-
-_PEOPLE: dict[str, PeopleInEvent] = {
-    "cut_in": PeopleInEvent(CUT_IN_CONTACTS_100CAR, CUT_IN_NEAR_CRASHES_100CAR),
-    "stop": PeopleInEvent(STOP_CONTACTS_100CAR, STOP_NEAR_CRASHES_100CAR),
-    "slowing": PeopleInEvent(SLOWING_CONTACTS_100CAR, SLOWING_NEAR_CRASHES_100CAR),
-}
-
-
-def people_in(event: Event) -> PeopleInEvent:
-    """Return people's contacts and near-crashes in one kind of event (100-Car, by precipitating event).
-
-    Five near-crashes with a lead "at a slower constant speed" belong to none of them.
-
-    Raises:
-        KeyError: If there is no such event.
-
-    Example:
-        >>> people_in("stop").contacts.count, people_in("stop").near_crashes.count
-        (13, 132)
-    """
-    return _PEOPLE[event]
-
-
-CALIBRATED_WITHIN = 3.0
-"""Factor within which the human driver model has to meet people's interval for a rate to count as calibrated."""
-
-
-class ModelCount(NamedTuple):
-    """Probability per event that the human driver model ends it in a contact, or in a near-crash.
-
-    Example:
-        >>> ModelCount(p=2.0e-5, low=1.0e-5, high=3.0e-5).factor_from(4e-6, 1e-5)
-        2.0
-    """
-
-    p: float
-    low: float
-    """Ends of its sampling interval, 95 %."""
-    high: float
-
-    def factor_from(self, low: float, high: float) -> float:
-        """Return how many times it is above the upper end of an interval, or below the lower one (then under 1).
-
-        1 inside. Where nothing was counted the upper end of its own interval is compared, and must be below.
-        """
-        p = self.p if self.p > 0 else self.high
-        if p < low:
-            return p / low
-        return self.p / high if self.p > high else 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class EventCalibration:
-    """The human driver model beside people in one kind of event, as `benchmarks.driving.human_calibration` measured it.
-
-    Example:
-        >>> counts = {"human": {"contacts": ModelCount(1.5e-5, 0.7e-5, 2.8e-5)}}
-        >>> found = EventCalibration(event="cut_in", base="us101", per_km=0.26, drivers=counts, provisional=True)
-        >>> f"{found.factor():.1f} times the upper end of people's {found.people('contacts')[1][1]:.1e}"
-        "2.3 times the upper end of people's 6.7e-06"
-        >>> found.is_calibrated  # within a factor of 3
-        True
-    """
-
-    event: Event
-    base: str
-    """Name of the base distribution."""
-    per_km: float
-    """Frequency of the events."""
-    drivers: Mapping[str, Mapping[str, ModelCount]]
-    """Contacts and near-crashes per event of "human" and "human:no-headway-rule", by `Outcome`."""
-    provisional: bool
-    """Whether the figures are those of the prototype, before the drivers that are shipped were measured."""
-
-    def people(self, outcome: Outcome) -> tuple[float, RateInterval]:
-        """Return people's probability per event and its interval."""
-        benchmark: HumanBenchmark = getattr(people_in(self.event), outcome)
-        return benchmark.per_event(self.per_km)
-
-    def factor(self, outcome: Outcome = "contacts", driver: str = "human") -> float:
-        """Return the factor by which a driver misses people's interval per event; see `ModelCount.factor_from`."""
-        return self.drivers[driver][outcome].factor_from(*self.people(outcome)[1])
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether `human` has contacts within a factor `CALIBRATED_WITHIN` of people's interval."""
-        return 1.0 / CALIBRATED_WITHIN <= self.factor() <= CALIBRATED_WITHIN
-
-
-@cache
-def calibration() -> Mapping[Event, EventCalibration]:
-    """Return the calibration of the human driver model by event, from `rare_envs/data/human_calibration.json`.
-
-    Example:
-        >>> sorted(calibration())
-        ['cut_in', 'slowing', 'stop']
-    """
-    content = json.loads((resources.files("rare_envs") / "data" / "human_calibration.json").read_text("utf-8"))
-    of = {event: next(iter(bases.items())) for event, bases in content["events"].items()}
-    return {
-        event: EventCalibration(
-            event=event,
-            base=base,
-            per_km=found["per_km"],
-            drivers={
-                driver: {outcome: ModelCount(*count) for outcome, count in counts.items()}
-                for driver, counts in found["drivers"].items()
-            },
-            provisional=content["provisional"],
-        )
-        for event, (base, found) in of.items()
-    }

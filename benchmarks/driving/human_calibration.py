@@ -5,7 +5,7 @@
 drives draws of each stratum (cutters who looked, cutters who did not, leads that stop, leads that slow) with the human
 driver model, its bracket, the IDM and the shipped egos, and counts contacts and near-crashes (`near_crash`); takes away
 parts of the model one at a time; compares per event and per million km with people's counts by precipitating event
-(`rare_envs.exposure.people_in`); and says which targets are met. It writes benchmarks/results/human_calibration.json,
+(`rare_envs.people.people_in`); and says which targets are met. It writes benchmarks/results/human_calibration.json,
 rare_envs/data/human_calibration.json (what the package prints beside rates) and the end of docs/human_driver.md.
 
 People's counts are those of all roads; how often the events happen is the `EventFrequency` of the base distribution. No
@@ -31,20 +31,21 @@ import typer
 from torch import Tensor
 
 import rare_envs
-import rare_envs.exposure
+import rare_envs.people
 from agents import load_ego
 from benchmarks import RESULTS
 from rare_envs.distributions.fitted import EventFrequency
 from rare_envs.egos.human import HUMAN_EGOS, HumanEgo
-from rare_envs.exposure import MILLION_KM, Event, EventCalibration, ModelCount, Outcome, people_in
+from rare_envs.exposure import MILLION_KM
 from rare_envs.measures.registry import NearCrash, NearCrashState
+from rare_envs.people import Event, EventCalibration, ModelCount, Outcome, people_in
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.cut_in import CutterModel
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from samplers.sample import clopper_pearson
 
 CALIBRATION_RESULT = RESULTS / "human_calibration.json"
-CALIBRATION_OF_PACKAGE = Path(rare_envs.exposure.__file__).parent / "data" / "human_calibration.json"
+CALIBRATION_OF_PACKAGE = Path(rare_envs.people.__file__).parent / "data" / "human_calibration.json"
 PAGE, MEASURED = Path("docs/human_driver.md"), "## Measured"
 CONFIDENCE = 0.95
 CUT_IN, HARD_BRAKE = "rare_envs/CutIn-v1", "rare_envs/HardBrake-v0"
@@ -293,12 +294,12 @@ def calibrate(cells: Sequence[CalibrationCell], site: str) -> dict[Event, EventC
                         [(w, own[name].probability(own[name].near_crashes)) for name, w in shares.items()]
                     ),
                 }
-        found[event] = EventCalibration(event=event, base=site, per_km=per_km, drivers=drivers, provisional=False)
+        found[event] = EventCalibration(event=event, base=site, per_km=per_km, drivers=drivers)
     return found
 
 
 def to_package(cells: Sequence[CalibrationCell], sites: Sequence[str], command: str) -> dict[str, Any]:
-    """Return what `rare_envs.exposure.calibration` reads, by event and base: the bracket alone."""
+    """Return what `rare_envs.people.calibration` reads, by event and base: the bracket alone."""
     events: dict[Event, dict[str, Any]] = {event: {} for event in EVENT_WORDS}
     for site in sites:
         for event, each in calibrate(cells, site).items():
@@ -307,7 +308,7 @@ def to_package(cells: Sequence[CalibrationCell], sites: Sequence[str], command: 
                 for ego in (HUMAN, BRACKET)
             }
             events[event][site] = {"per_km": each.per_km, "drivers": counts}
-    return {"provisional": False, "command": command, "events": events}
+    return {"command": command, "events": events}
 
 
 # --- the page -----------------------------------------------------------------------------------
@@ -405,14 +406,14 @@ def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCe
         f"Contacts among the conflicts with cutters who had not looked: {low:.1%} to {high:.1%}; people none of 44 own "
         "and none of 58 sideswipe conflicts, under 3.6 %."
     )
-    km, near = rare_envs.exposure.UNSEEN_CHANGES_100CAR, unseen.near_crashes / unseen.draws
+    km, near = rare_envs.people.UNSEEN_CHANGES_100CAR, unseen.near_crashes / unseen.draws
     share = km.per_million_km / MILLION_KM / cut_ins.per_km / near if near > 0 else math.nan
     shares = find_events(site)["cut_in"][1]
     told.append(
         f"The share of cutters who had not looked that gives people's 44 near-crashes in own changes: {share:.1e} "
         f"(the base has {shares['unseen']:.1e}): what they add to near-crashes is calibrated, not predicted."
     )
-    scale = people_in("cut_in").near_crashes.miles * rare_envs.exposure.KM_PER_MILE * cut_ins.per_km
+    scale = people_in("cut_in").near_crashes.miles * rare_envs.people.KM_PER_MILE * cut_ins.per_km
     own = sum(shares[name] * of[name].counter / of[name].draws for name in shares)
     theirs = sum(shares[name] * of[name].evaded / of[name].draws for name in shares)
     told.append(

@@ -11,26 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 import samplers
-from rare_envs.exposure import (
-    MILLION_KM,
-    CollisionRate,
-    Event,
-    EventCalibration,
-    HumanBenchmark,
-    RateInterval,
-    calibration,
-    people_in,
-)
+from rare_envs.exposure import MILLION_KM, CollisionRate, RateInterval
+from rare_envs.people import Event, EventCalibration, HumanBenchmark, calibration, people_in
+from rare_envs.scenarios.registry import env_id_of, find_scenario
 from samplers import analysis
 from samplers.analysis.base_error import BaseUncertainty
 from samplers.problem import FloatArray
 from samplers.sample import Interval
+
+if TYPE_CHECKING:
+    from rare_envs.study.question import Study
 
 MODEL, BRACKET = "human", "human:no-headway-rule"
 """The human driver model, and the one that brackets people together with it."""
@@ -63,8 +59,10 @@ class EventRate:
     """Share of the scenario's events that are of this kind."""
     parts: Mapping[str, float]
     """Shares of the rate by stratum; empty where there is one stratum, or nothing failed."""
+    traffic: str
+    """The base distribution, and the options that make other traffic of it."""
     calibration: EventCalibration | None
-    """The human driver model in this event; None where nobody has measured it in this scenario."""
+    """The human driver model in this event and traffic; None where nobody has measured it."""
 
     @property
     def people(self) -> HumanBenchmark | None:
@@ -72,14 +70,15 @@ class EventRate:
         return people_in(self.event).contacts if self.event in COUNTED else None  # type: ignore[arg-type]
 
     @property
-    def factor(self) -> float | None:
-        """Factor by which the human driver model misses people's interval; None where it is not known."""
-        return None if self.calibration is None else self.calibration.factor("contacts", MODEL)
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether the human driver model has contacts within a factor `CALIBRATED_WITHIN` of people's interval."""
-        return self.calibration is not None and self.calibration.is_calibrated
+    def uncalibrated(self) -> str:
+        """Why the rate is not calibrated: the human driver model misses people, or was not measured; empty if it is."""
+        if self.calibration is None:
+            return f"no calibration of {self.traffic}"
+        if self.calibration.is_calibrated:
+            return ""
+        factor = self.calibration.factor()
+        times = f"{factor:.2g} times above" if factor > 1.0 else f"{1.0 / factor:.2g} times below"
+        return f"uncalibrated, {times} people"
 
     def model_interval(self, driver: str = MODEL) -> tuple[float, RateInterval] | None:
         """Return contacts per million km of a human driver model, and their interval."""
@@ -97,13 +96,12 @@ class EventRate:
             **self.rate.to_dict(),
             "parts": dict(self.parts),
             "people": None if self.people is None else self.people.to_dict(),
-            "calibrated": self.is_calibrated,
+            "uncalibrated": self.uncalibrated,
             "calibration": None
             if self.calibration is None
             else {
                 "base": self.calibration.base,
-                "provisional": self.calibration.provisional,
-                "factor": self.factor,
+                "factor": self.calibration.factor(),
                 "per_million_km": {
                     name: {"value": found[0], "interval": list(found[1])} for name, found in models.items() if found
                 },
@@ -121,16 +119,20 @@ def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
     return replace(known[0], count=sum(each.count for each in known), kind=kinds, words="sum of the kinds of event")
 
 
-def find_calibration(event: str, env_id: str, base: Any) -> EventCalibration | None:
-    """Return the calibration of an event, where the environment and the base are of the kind that was calibrated.
+def describe_traffic(study: Study) -> str:
+    """Return the base distribution of a study, and the options that make other traffic of it."""
+    changed = [f"--{name}" for name in ("drivers", "horizon") if getattr(study.question, name) is not None]
+    return f"{study.base_name} with {' and '.join(changed)}" if changed else study.base_name
 
-    These are the newest version of the scenario with strata in its base, as the scripts of earlier ones and the test
-    distributions have drivers as there are none.
+
+def find_calibration(event: str, study: Study) -> EventCalibration | None:
+    """Return the calibration of an event in the traffic of a study; None where nobody measured it.
+
+    It is that of the newest version of the scenario: the scripts of earlier ones have drivers as there are none.
     """
-    from rare_envs.scenarios.registry import env_id_of, find_scenario
-
+    env_id = study.question.env_id
     newest = env_id_of(find_scenario(env_id).name) == env_id.rpartition(":")[2]
-    return calibration().get(event) if newest and list_strata(base) else None  # type: ignore[call-overload]
+    return calibration(event, describe_traffic(study)) if newest else None  # type: ignore[arg-type]
 
 
 def list_strata(base: Any) -> tuple[Any, ...]:

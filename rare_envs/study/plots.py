@@ -18,8 +18,9 @@ from PIL import Image, ImageDraw
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.envs import rendering
-from rare_envs.exposure import HumanBenchmark, RateInterval, TotalRate
+from rare_envs.exposure import RateInterval, TotalRate
 from rare_envs.files import replace_file
+from rare_envs.people import HumanBenchmark
 from rare_envs.plugins import EgoGone, reason_of
 from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
@@ -287,7 +288,7 @@ def save_risk_plot(
 def _name_row(each: EventRate) -> str:
     """Return an event in words, and whether its rate is calibrated."""
     name = EVENT_NOUNS.get(each.event, each.event)
-    return name if each.is_calibrated else f"{name}\n(uncalibrated)"
+    return f"{name}\n({each.uncalibrated})" if each.uncalibrated else name
 
 
 def draw_rates(axes: Axes, rows: Sequence[tuple[str, float, RateInterval, HumanBenchmark | None]]) -> None:

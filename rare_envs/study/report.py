@@ -20,7 +20,7 @@ from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
-from rare_envs.study.events import COUNTED, EventRate, find_calibration, split_by_stratum
+from rare_envs.study.events import COUNTED, EventRate, describe_traffic, find_calibration, split_by_stratum
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
@@ -309,8 +309,7 @@ class Report:
         """The rate of each kind of event that the scenario stands for; empty where `no_rate` says why there is none."""
         if self.rate is None:
             return ()
-        base, env_id = self.study.problem.base, self.study.question.env_id
-        parts = split_by_stratum(self.estimate, base)
+        parts = split_by_stratum(self.estimate, self.study.problem.base)
         whole = {part.name: part.value / self.estimate.p for part in parts if self.estimate.p > 0}
         whole_p = self.rate.probability
         most = whole_p.upper if whole_p.interval is None or not whole_p.determined else whole_p.interval[1]
@@ -326,7 +325,8 @@ class Report:
                 share=share,
                 rate=rate,
                 parts=whole if len(found) == 1 else {},
-                calibration=find_calibration(name, env_id, base),
+                traffic=describe_traffic(self.study),
+                calibration=find_calibration(name, self.study),
             )
             for name, share, rate in found
             if rate is not None

@@ -16,6 +16,7 @@ import agents
 from rare_envs import exposure
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import format_json, replace_text
+from rare_envs.people import HumanBenchmark
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import env_id_of, scenario_named
@@ -167,7 +168,7 @@ class Risk:
         return tuple(each for scenario in self.scenarios for each in scenario.report.events)
 
     @property
-    def people(self) -> exposure.HumanBenchmark | None:
+    def people(self) -> HumanBenchmark | None:
         """Contacts of people in the same events together; None where those of one kind were not counted."""
         return sum_people(self.events)
 
@@ -187,10 +188,12 @@ class Risk:
 
     def __str__(self) -> str:
         """Return the table, for people: the total first, a line for each event, warnings last."""
-        total, kinds, people = self.total, self.kinds, self.people
+        total, kinds, counted = self.total, self.kinds, self.people
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
-        per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, " ", level)
-        beside = "" if people is None else f"; people in the same events {text.describe_people(people)}"
+        per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, "", level)
+        beside = "" if counted is None else f"; people in the same events {text.describe_people(counted)}"
+        missed = text.list_uncalibrated(self.events)
+        beside += f"; uncalibrated in {missed}" if missed else ""
         lines = [
             f"{self.ego}: collisions per million km {per_km}{beside}",
             *(f"  {line}" for line in text.tabulate_events(self.events)),
@@ -201,7 +204,7 @@ class Risk:
         lines += [] if self.injuries is None else [f"  injuries     {text.describe_injuries(self.injuries)}"]
         lines += [f"  uncertainty  {said}" for said in filter(None, [text.describe_uncertainty(total)])]
         lines.append(f"  traffic      {'; '.join(each.describe_traffic() for each in self.scenarios)}")
-        lines += [f"  human model  {text.describe_columns(self.events)}"]
+        lines += [f"  human model  {text.describe_columns()}"]
         return "\n".join(
             [*lines, *(f"note: {each}" for each in self.notes), *(f"warning: {each}" for each in self.warnings)]
         )

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 import samplers
-from rare_envs import exposure
+from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
 from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
@@ -83,23 +83,22 @@ def describe_injuries(rate: exposure.CollisionRate | exposure.TotalRate) -> str:
     )
 
 
-def describe_people(people: exposure.HumanBenchmark | None) -> str:
+def describe_people(counted: people.HumanBenchmark | None) -> str:
     """Return people's contacts per million km with their interval."""
-    if people is None:
+    if counted is None:
         return "not counted"
-    return format_with_interval(people.per_million_km, people.interval_per_million_km)
+    return format_with_interval(counted.per_million_km, counted.interval_per_million_km)
 
 
 def describe_model(each: EventRate) -> str:
     """Return what the human driver model and its bracket score per million km, and by what factor they miss people."""
     scores = [found[0] for found in map(each.model_interval, (MODEL, BRACKET)) if found is not None]
-    if each.factor is None:
-        return "uncalibrated"
-    words = " to ".join(dict.fromkeys(format_alike(*scores)))
-    if each.is_calibrated:
-        return words
-    factor, side = (each.factor, "above") if each.factor > 1 else (1 / each.factor, "below")
-    return f"{words}: uncalibrated, {factor:.2g} times {side} people"
+    return ": ".join(filter(None, (" to ".join(dict.fromkeys(format_alike(*scores))), each.uncalibrated)))
+
+
+def list_uncalibrated(events: Sequence[EventRate]) -> str:
+    """Return the kinds of event without a calibrated rate; empty where there is none."""
+    return ", ".join(EVENT_NOUNS.get(each.event, each.event) for each in events if each.uncalibrated)
 
 
 def describe_parts(shares: Mapping[str, float]) -> str:
@@ -129,14 +128,12 @@ def tabulate_events(events: Sequence[EventRate]) -> list[str]:
     return [head, *(line for row, more in zip(lines, parts, strict=True) for line in (row, *more))]
 
 
-def describe_columns(events: Sequence[EventRate]) -> str:
+def describe_columns() -> str:
     """Return what the columns of people and of the human driver model are."""
-    provisional = any(each.calibration is not None and each.calibration.provisional for each in events)
-    words = (
-        f"{MODEL} to {BRACKET} in the same events; within a factor {exposure.CALIBRATED_WITHIN:g} of people's interval "
+    return (
+        f"{MODEL} to {BRACKET} in the same events; within a factor {people.CALIBRATED_WITHIN:g} of people's interval "
         "a rate is calibrated (people: 100-Car, contacts at any speed)"
     )
-    return f"{words}; its figures are provisional" if provisional else words
 
 
 def describe_uncertainty(total: exposure.TotalRate) -> str:

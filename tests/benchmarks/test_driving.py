@@ -28,7 +28,7 @@ from benchmarks.driving.human_calibration import (
 from benchmarks.training import retraining
 from benchmarks.training.retraining import RetrainingRound, compare_arms, draw_rounds, format_rounds, run_arm
 from rare_envs.control.human_driver import MAX_HUMAN_BRAKING
-from rare_envs.exposure import ModelCount
+from rare_envs.people import ModelCount
 from rare_envs.scenarios.registry import SCENARIOS
 
 

@@ -16,7 +16,8 @@ import rare_envs
 import samplers
 from rare_envs.distributions import CutNormals, EventCounts, EventFrequency, FittedDistribution, StratifiedDistribution
 from rare_envs.distributions.stratified import Stratum
-from rare_envs.exposure import CollisionProbability, CollisionRate, ModelCount, calibration
+from rare_envs.exposure import CollisionProbability, CollisionRate
+from rare_envs.people import calibration
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.simulation.observation import observation_space
@@ -24,7 +25,7 @@ from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.events import EventRate, split_by_stratum, sum_people
 from rare_envs.study.report import describe_left_out, find_frequency
 from rare_envs.study.risk import choose_base, compare_sites
-from rare_envs.study.text import describe_model, format_rate, format_with_interval, tabulate_events
+from rare_envs.study.text import describe_model, format_rate, format_with_interval, list_uncalibrated, tabulate_events
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
 
 FEW = {"method": "mc", "max_sim": 400}
@@ -228,7 +229,7 @@ def test_each_event_stands_beside_people_in_it() -> None:
         frequency=EventFrequency(count=268, hours=5.64, km=218.0, definition="brakings", source="US 101"),
     )
     events = [
-        EventRate(event=name, rate=rate, share=share, parts={}, calibration=calibration().get(name))
+        EventRate(event=name, rate=rate, share=share, parts={}, traffic="us101", calibration=calibration(name, "us101"))
         for name, share in (("cut_in", 1.0), ("stop", 0.15), ("slowing", 0.85))
     ]
     people = sum_people(events)
@@ -257,9 +258,8 @@ def test_brakings_of_two_kinds_are_two_events(tmp_path: Path, bases: dict[str, s
     assert found.people.count == 13
     assert [each["event"] for each in found.to_dict()["events"]] == ["slowing", "stop"]
     lines = str(found).splitlines()
-    assert lines[0].endswith("; people in the same events 4.0 (2.2 to 6.9)") and lines[2].startswith(
-        "  slowings of the"
-    )
+    beside = "; people in the same events 4.0 (2.2 to 6.9); uncalibrated in slowings of the lead, stops of the lead"
+    assert lines[0].endswith(beside) and lines[2].startswith("  slowings of the")
 
 
 def test_a_part_without_a_failure_has_an_upper_end(tmp_path: Path) -> None:
@@ -270,17 +270,35 @@ def test_a_part_without_a_failure_has_an_upper_end(tmp_path: Path) -> None:
         assert each.rate.interval_per_million_km[1] > each.share * 1e6 * 42 / 218 * 3 / 400  # the rule of three
 
 
-def test_a_rate_is_uncalibrated_where_the_model_misses_people_by_more_than_a_factor_of_three() -> None:
-    """12 times the upper end of people's interval in stops is 12 x 1.62e-5 x their frequency."""
-    known = calibration()["stop"]
-    upper = known.people("contacts")[1][1]
-    for factor, calibrated in ((2.9, True), (12.0, False)):
-        drivers = {
-            name: {"contacts": ModelCount(factor * upper, 0.0, 1.0)} for name in ("human", "human:no-headway-rule")
-        }
-        found = EventRate(event="stop", rate=None, share=1.0, parts={}, calibration=replace(known, drivers=drivers))
-        assert found.is_calibrated is calibrated
-        assert ("uncalibrated, 12 times above people" in describe_model(found)) is not calibrated
+def event_of(base: str | None, env_id: str = "rare_envs/CutIn-v1", **changes):
+    asked = Question(env_id=env_id, base=base, method="mc", max_sim=100, **changes)
+    report = run(prepare(asked))
+    assert report.to_dict()["events"][0]["uncalibrated"] == report.events[0].uncalibrated
+    return report.events[0]
+
+
+def test_the_calibration_is_that_of_the_base_and_a_miss_by_more_than_three_has_its_factor() -> None:
+    """Contacts of `human` per cut-in over the upper end of people's: 5.572 contacts in 3.2187e6 km."""
+    at_home, elsewhere = event_of("us101"), event_of("i80")
+    assert (at_home.calibration.base, elsewhere.calibration.base) == ("us101", "i80")
+    assert at_home.uncalibrated == "" == list_uncalibrated([at_home])
+    factor = elsewhere.calibration.drivers["human"]["contacts"].p * elsewhere.calibration.per_km * 3.2187e6 / 5.572
+    assert factor > 3.0 and elsewhere.uncalibrated == f"uncalibrated, {factor:.2g} times above people"
+    assert describe_model(elsewhere).endswith(f": {elsewhere.uncalibrated}")
+    assert list_uncalibrated([at_home, elsewhere]) == "cut-ins"
+
+
+def test_traffic_that_nobody_calibrated_is_said_to_have_no_calibration(bases: dict[str, str]) -> None:
+    """The test distribution, one's own base, the script of CutIn-v0, and episodes that are cut short."""
+    own = bases["cut_in"]
+    for found, traffic in (
+        (event_of("us101-test"), "us101-test"),
+        (event_of(own), own),
+        (event_of("us101", "rare_envs/CutIn-v0"), "us101"),
+        (event_of("us101", horizon=2.0), "us101 with --horizon"),
+    ):
+        assert found.calibration is None
+        assert describe_model(found) == f"no calibration of {traffic}"
 
 
 class Policy:

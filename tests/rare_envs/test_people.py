@@ -4,7 +4,8 @@ import csv
 
 import pytest
 
-from rare_envs.exposure import (
+from rare_envs.people import (
+    HUMAN_BENCHMARKS,
     UNSEEN_CHANGES_100CAR,
     EventCalibration,
     ModelCount,
@@ -70,23 +71,51 @@ def test_factor_by_which_a_model_misses_an_interval(model, factor):
     assert model.factor_from(1e-5, 2e-5) == pytest.approx(factor)
 
 
-@pytest.mark.parametrize(("times", "calibrated"), [(2.9, True), (3.1, False)])
-def test_calibrated_is_within_a_factor_of_3_of_either_end(times, calibrated):
+def test_calibrated_is_within_a_factor_of_3_of_either_end():
     """13 contacts have the exact Poisson interval 6.92 to 22.23."""
     low, high = (k / KM_100CAR / 0.19 for k in (6.922, 22.23))
-    for p in (high * times, low / times):
-        counts = {"human": {"contacts": ModelCount(p, p, p)}}
-        found = EventCalibration(event="stop", base="us101", per_km=0.19, drivers=counts, provisional=True)
-        assert found.is_calibrated == calibrated
+    for times, calibrated in ((2.9, True), (3.1, False)):
+        for p in (high * times, low / times):
+            counts = {"human": {"contacts": ModelCount(p, p, p)}}
+            found = EventCalibration(event="stop", base="us101", per_km=0.19, drivers=counts)
+            assert found.is_calibrated == calibrated
 
 
-def test_the_shipped_calibration_has_every_event_and_both_drivers_of_the_bracket():
-    assert sorted(calibration()) == ["cut_in", "slowing", "stop"]
-    for event, found in calibration().items():
-        assert found.event == event
-        assert found.per_km > 0
+def test_the_shipped_calibration_has_both_drivers_of_the_bracket_at_each_site():
+    for event, base in (("cut_in", "us101"), ("cut_in", "i80"), ("stop", "us101"), ("slowing", "us101")):
+        found = calibration(event, base)
+        assert (found.event, found.base) == (event, base)
         for driver in ("human", "human:no-headway-rule"):
             for outcome in ("contacts", "near_crashes"):
                 count = found.drivers[driver][outcome]
                 assert 0.0 <= count.low <= count.p <= count.high < 1.0
-                assert found.factor(outcome, driver) > 0.0
+
+
+TABLE = {
+    ("100-Car", "contacts of all kinds"): (21, 16, 27, 1.6e-3),
+    ("100-Car", "near-crashes"): (236, 220, 254, 1.8e-2),
+    ("100-Car", "contacts into a vehicle ahead"): (4.3, 2.4, 7.3, 3.3e-4),
+    ("100-Car", "near-crashes with a vehicle ahead"): (120, 108, 132, 9.0e-3),
+    ("100-Car", "contacts begun by another's lane change"): (0.31, 0.01, 1.7, 2.3e-5),
+    ("100-Car", "near-crashes begun by another's lane change"): (42, 36, 50, 3.2e-3),
+    ("100-Car", "contacts with a lead that stopped"): (4.0, 2.15, 6.9, 3.0e-4),
+    ("100-Car", "near-crashes with a lead that stopped"): (41, 34.3, 48.6, 3.1e-3),
+    ("100-Car", "contacts with a lead that slowed"): (0.0, 0.0, 1.15, 0.0),
+    ("100-Car", "near-crashes with a lead that slowed"): (47.2, 40.0, 55.4, 3.5e-3),
+    ("100-Car", "near-crashes in own lane changes into a vehicle that was not seen"): (13.7, 9.9, 18.4, 1.02e-3),
+    ("SHRP 2", "crashes without tyre strikes"): (15, None, None, None),
+    ("SHRP 2", "severe crashes"): (4.5, None, None, None),
+}
+"""Per million km with its interval, and per hour."""
+
+
+@pytest.mark.parametrize("benchmark", HUMAN_BENCHMARKS, ids=lambda each: f"{each.study} {each.kind}")
+def test_rates_of_people(benchmark):
+    rate, low, high, per_hour = TABLE[benchmark.study, benchmark.kind]
+    assert benchmark.per_million_km == pytest.approx(rate, rel=0.03)
+    if low is not None:
+        assert benchmark.interval_per_million_km == pytest.approx((low, high), rel=0.03, abs=0.005)
+    assert benchmark.per_hour == (None if per_hour is None else pytest.approx(per_hour, rel=0.03))
+    assert benchmark.source
+    assert benchmark.words
+    assert benchmark.to_dict()["per_million_km"] == benchmark.per_million_km
