@@ -34,7 +34,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.events import EventFrequency
 
 __all__ = ["CollisionProbability", "CollisionRate", "TotalRate", "VarianceShare"]
 

@@ -34,7 +34,7 @@ import rare_envs
 import rare_envs.people
 from agents import load_ego
 from benchmarks import RESULTS
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.events import EventFrequency
 from rare_envs.egos.human import HUMAN_EGOS, HumanEgo
 from rare_envs.exposure import MILLION_KM
 from rare_envs.measures.registry import NearCrash, NearCrashState

@@ -3,13 +3,8 @@
 from rare_envs.distributions.acceptance import AcceptedGaps
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates, Difference
-from rare_envs.distributions.fitted import (
-    EventCounts,
-    EventFrequency,
-    FittedDistribution,
-    PredictiveCheck,
-    join_independent,
-)
+from rare_envs.distributions.events import EventCounts, EventFrequency, PredictiveCheck
+from rare_envs.distributions.fitted import FittedDistribution, join_independent
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 from rare_envs.distributions.space import Distribution, DistributionParameter, Parameter, ScenarioSpace

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import samplers
 from agents.saved_ego import SavedEgo
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.events import EventFrequency
 from rare_envs.egos.wrappers import describe_missing_normalisation
 from rare_envs.exposure import MILLION_KM, CollisionProbability, CollisionRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.events import EventFrequency
 from rare_envs.exposure import CollisionProbability, CollisionRate, TotalRate
 
 

@@ -6,7 +6,8 @@ import numpy as np
 
 import rare_envs
 import samplers
-from rare_envs.distributions.fitted import EventCounts, FittedDistribution
+from rare_envs.distributions.events import EventCounts
+from rare_envs.distributions.fitted import FittedDistribution
 
 
 def problem(base):

@@ -41,6 +41,12 @@ LEAST_SPEED = -0.2
 """Smoothed speed [m/s] below which the record of a braking is broken."""
 END_TICKS = 10
 """Ticks at both ends of a track in which no braking begins or ends: accelerations are least certain there."""
+MEAN_SECONDS, ANSWER_SECONDS = 2.0, 3.0
+"""Time after an event over which the mean acceleration is taken, and within which the hardest braking [s]."""
+MEAN_REACH = 3
+"""Ticks on either side of the later moment whose mean speed is taken."""
+ANSWERS = ("mean_a_ego", "braking_ego", "mean_a_cutin", "braking_cutin")
+"""Columns of what follows the start of a cut-in: those of `measure_answer` of the ego and of the cutter."""
 SHORTEST_TRACK = 42
 """Ticks below which a track is too short to show a braking."""
 
@@ -135,11 +141,12 @@ def cut_in_events(trajectories: Trajectories) -> Events:
 
     Returns:
         The columns recording, frame, phase, vehicle, from_lane, to_lane, start_seen, v_cutin, lateral_speed, ego,
-        v_ego, gap_ego_cutin, lateral_offset, lead, v_lead, gap_cutin_lead and duration, each of shape (2 changes,). Ego
-        is the nearest vehicle behind in the new lane, lead the nearest ahead in it, -1 and NaN where there is none.
-        Gaps are bumper to bumper (negative: side by side). Also the lateral offset from ego [m]; `lateral_speed`
-        towards the new lane over 0.8 s around the crossing [m/s]; `duration` of the cubic course that moves across for
-        as long [s], NaN where start or end was not recorded.
+        v_ego, gap_ego_cutin, lateral_offset, lead, v_lead, gap_cutin_lead, duration and those of `ANSWERS`, each of
+        shape (2 changes,). Ego is the nearest vehicle behind in the new lane, lead the nearest ahead in it, -1 and NaN
+        where there is none. Gaps are bumper to bumper (negative: side by side). Also the lateral offset from ego [m];
+        `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s]; `duration` of the cubic course that
+        moves across for as long [s], NaN where start or end was not recorded; of ego and cutter, see `measure_answer`,
+        the mean acceleration and the hardest braking that follow [m/s^2].
 
     Example:
         >>> from dataclasses import replace
@@ -162,6 +169,7 @@ def cut_in_events(trajectories: Trajectories) -> Events:
     ego, lead = _find_neighbours(t, rows, t.lane[change])
     side = np.sign(t.lane[change] - t.lane[change - 1])
     reach = MIN_LANE_FRAMES // 2
+    answers = np.hstack([measure_answers(breaks, t.x, t.speed, which) for which in (ego, rows)])
     return {
         "recording": t.recording[rows],
         "frame": t.frame[rows],
@@ -180,7 +188,43 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         "v_lead": np.where(lead >= 0, t.speed[lead], np.nan),
         "gap_cutin_lead": bumper_gaps(t, rows, lead),
         "duration": np.repeat(durations, 2),
+        **dict(zip(ANSWERS, answers.T, strict=True)),
     }
+
+
+def measure_answers(
+    breaks: NDArray[np.int64], position: FloatArray, speed: FloatArray, rows: NDArray[np.int64]
+) -> FloatArray:
+    """Return what follows rows of tracks one behind the other, (n, 2), see `measure_answer`; NaN where a row is -1.
+
+    The tracks begin at the rows `breaks`; position [m] and speed [m/s] are theirs.
+    """
+    ends = np.append(breaks, len(position))
+    track = np.searchsorted(breaks, rows, side="right") - 1
+    spans = np.column_stack([rows, ends[track], ends[track + 1]]).tolist()
+    found = [
+        measure_answer(position[first:end], speed[first:end], row - first) if row >= 0 else (np.nan, np.nan)
+        for row, first, end in spans
+    ]
+    return np.array(found).reshape(-1, 2)
+
+
+def measure_answer(position: FloatArray, speed: FloatArray, at: int) -> tuple[float, float]:
+    """Return the mean acceleration over the 2 s after a tick of a track, and the hardest braking in 3 s [m/s^2].
+
+    Position along the road [m] and speed as recorded [m/s] have shape (T,). The later speed is the mean of 0.7 s
+    about its moment, as speeds jitter; the braking is that of the positions smoothed at 0.40 Hz, 0 where there is
+    none. NaN where the track ends before.
+    """
+    later, last = at + round(MEAN_SECONDS / DT), at + round(ANSWER_SECONDS / DT)
+    mean, braking = np.nan, np.nan
+    if later < len(speed):
+        reach = min(MEAN_REACH, len(speed) - 1 - later)
+        mean = (speed[later - reach : later + reach + 1].mean() - speed[at]) / MEAN_SECONDS
+    if last < len(position):
+        slope = np.gradient(np.gradient(smooth_positions(position, CUTOFF_ALONG), DT), DT)
+        braking = max(-slope[at : last + 1].min(), 0.0)
+    return float(mean), float(braking)
 
 
 def _find_neighbours(

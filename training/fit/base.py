@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.fitted import EventFrequency, FittedDistribution, PredictiveCheck
+from rare_envs.distributions.events import EventFrequency, PredictiveCheck
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.scenarios.registry import scenario_named

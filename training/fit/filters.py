@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, csv
 
-from rare_envs.distributions.fitted import EventCounts
+from rare_envs.distributions.events import EventCounts
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
+from training.data.events import ANSWERS
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class EventRecipe:
     """Columns of truth values that must hold for the columns fitted separately."""
     excluded: tuple[str, ...] = ()
     """Columns of truth values that must not hold for any column."""
+    answers: tuple[str, ...] = ()
+    """Columns of what was recorded after an event, which nothing is fitted to."""
     where: Mapping[str, Any] = field(default_factory=dict)
     """Values of other columns in the rows that are events, such as phase: start."""
     cluster: tuple[str, ...] = ("recording", "frame")
@@ -60,6 +63,8 @@ class EventSet:
     """Word for a cluster."""
     log: tuple[Mapping[str, Any], ...] = ()
     """What each filter dropped, see `filter_events`."""
+    answers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """What was recorded after each event of the columns fitted together, (n, b); NaN where it was not."""
 
     @property
     def counts(self) -> EventCounts:
@@ -78,6 +83,7 @@ EVENT_RECIPES = {
         apart=("lateral_offset", "duration"),
         required=("start_seen",),
         where={"phase": "start"},
+        answers=ANSWERS,
     ),
     "hard_brake": EventRecipe("hard_brake_events.csv", ("speed", "gap", "peak", "loss")),
 }
@@ -132,8 +138,9 @@ def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]
 def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
     """Return the columns of an events file, numbers as float64 with NaN where a value is missing."""
     others = (*recipe.required, *recipe.excluded, *recipe.where, *recipe.cluster)
-    events = read_csv_columns(path, (*recipe.columns, *others))
-    return events | {name: np.asarray(events[name], dtype=np.float64) for name in recipe.columns}
+    numbers = (*recipe.columns, *recipe.answers)
+    events = read_csv_columns(path, (*numbers, *others))
+    return events | {name: np.asarray(events[name], dtype=np.float64) for name in numbers}
 
 
 Rule = tuple[str, str, NDArray[np.bool_]]
@@ -176,11 +183,12 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
     log = [{"rule": "events read", "events": int(keep.sum())}]
     log += drop_events(keep, [*flag_rules(recipe.excluded, "not ", False), *usual_rules(joint, box)], joint)
     points, clusters = _table_of(events, joint, keep), _number_clusters(events, recipe)[keep]
+    answers = _table_of(events, recipe.answers, keep)
     if recipe.apart:
         rules = [*flag_rules(recipe.required, "", True), *usual_rules(recipe.apart, box[len(joint) :])]
         log += drop_events(keep, rules, recipe.apart)
     word = "scene" if recipe.cluster == ("scene",) else "half-minute"
-    return EventSet(points, clusters, _table_of(events, recipe.apart, keep), word, tuple(log))
+    return EventSet(points, clusters, _table_of(events, recipe.apart, keep), word, tuple(log), answers)
 
 
 def _table_of(events: Mapping[str, NDArray[Any]], columns: Sequence[str], keep: NDArray[np.bool_]) -> FloatArray:

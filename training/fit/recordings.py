@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.events import EventFrequency, describe_checks, describe_motion
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.files import replace_text
 from rare_envs.scenarios.base import load_base
@@ -71,10 +72,7 @@ EXTRACTORS = {
 CUT_IN, HARD_BRAKE = "cut_in", "hard_brake"
 LEAST_NEIGHBOURS = 500
 """Neighbours at random times that a recording of whole traffic has in its first minute."""
-TICKS_PER_SECOND, MOTION_TICKS, ANSWER_TICKS = 10, 20, 30
-"""Of neighbours; of the mean accelerations of cutters and followers; of the followers' hardest braking."""
-HARD_BRAKING = 3.4
-"""A deceleration that drivers rarely use [m/s^2]: AASHTO's of stopping sight distances."""
+TICKS_PER_SECOND = 10
 SECONDS_BETWEEN = 5.0
 """A count is printed when the line before it is this old [s], so that a short fit prints few lines."""
 
@@ -147,47 +145,6 @@ def _choose_neighbours(beside: Sequence[tuple[FloatArray, NDArray[Any]]]) -> Nei
     return load_base(scenario_named(CUT_IN), "us101")
 
 
-def measure_motion(table: Trajectories, events: Events) -> FloatArray:
-    """Return what cutters and followers did after the start of lane changes, one row each, NaN where not recorded.
-
-    Columns: mean accelerations of cutter and of follower over 2 s, and the follower's hardest braking within 3 s
-    [m/s^2], as smoothed.
-    """
-    first, after = table.track_starts(), np.append(table.track_starts()[1:], len(table))
-    tracks = {
-        (table.recording[a], int(table.vehicle[a])): slice(int(a), int(b)) for a, b in zip(first, after, strict=True)
-    }
-    starts = np.flatnonzero(events["phase"] == "start")
-    out = np.full((len(starts), 3), np.nan)
-    for row, i in enumerate(starts):
-        for column, vehicle in enumerate((events["vehicle"][i], events["ego"][i])):
-            track = tracks.get((events["recording"][i], int(vehicle)))
-            if track is None:
-                continue
-            frame = table.frame[track] - events["frame"][i]
-            speed = [table.speed[track][frame == at] for at in (0, MOTION_TICKS)]
-            if all(len(each) == 1 for each in speed):
-                out[row, column] = (speed[1][0] - speed[0][0]) / (MOTION_TICKS * DT)
-            window = table.acceleration[track][(frame >= 0) & (frame <= ANSWER_TICKS)]
-            if column == 1 and len(window) > ANSWER_TICKS:
-                out[row, 2] = -window.min()
-    return out
-
-
-def summarise_motion(rows: FloatArray) -> dict[str, Any]:
-    """Return counts, means and standard deviations of `measure_motion`, and the share of followers who brake hard."""
-    found: dict[str, Any] = {}
-    for name, column in (("cutters", rows[:, 0]), ("followers", rows[:, 1])):
-        known = column[np.isfinite(column)]
-        if len(known) > 1:
-            found[name] = {"events": len(known), "mean_over_2_s": round(float(known.mean()), 3)}
-            found[name]["sd"] = round(float(known.std(ddof=1)), 3)
-    braking = rows[np.isfinite(rows[:, 2]), 2]
-    if len(braking):
-        found["followers_braking_over_3.4"] = f"{int((braking > HARD_BRAKING).sum())} of {len(braking)} within 3 s"
-    return found
-
-
 def fit_own_bases(
     tables: Iterable[Trajectories],
     scenarios: Sequence[str] | None,
@@ -205,7 +162,7 @@ def fit_own_bases(
     chosen, tell = tuple(scenarios or EVENT_RECIPES), _make_teller(progress)
     out.mkdir(parents=True, exist_ok=True)
     names, traffic, parts = set[str](), np.zeros(4), list[dict[str, Events]]()
-    beside, motions = list[tuple[FloatArray, NDArray[Any]]](), list[FloatArray]()
+    beside = list[tuple[FloatArray, NDArray[Any]]]()
     for table in tables:
         here = sorted({*table.recording.tolist()})
         names.update(here)
@@ -214,7 +171,6 @@ def fit_own_bases(
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in chosen})
         if CUT_IN in chosen:
             beside.append(observe_neighbours(table))
-            motions.append(measure_motion(table, parts[-1][CUT_IN]))
     source = {
         "site": name,
         "data": f"recordings {', '.join(sorted(names))}",
@@ -238,7 +194,6 @@ def fit_own_bases(
                 check_starts(events)
                 others = _choose_neighbours(beside)
                 base = fit_cut_in(scenario, events, others, source, COMMAND, frequency=frequency, **asked)
-                base = replace(base, record={**base.record, "motion": summarise_motion(np.concatenate(motions))})
             else:
                 fit = fit_hard_brake if scenario == HARD_BRAKE else fit_base
                 base = fit(scenario, events, source, COMMAND, frequency=frequency, **asked)
@@ -249,6 +204,7 @@ def fit_own_bases(
                 raise ValueError(f"{words.format(', '.join(chosen))}: give more recordings.") from None
             typer.echo(f"{words.format(scenario)}.", err=True)
             continue
+        _print_checks(scenario, base)
         written.append(_write_base(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict())))
         if not base.refits:
             typer.echo(f"{base.fitted_to}: too few to say how far they determine {scenario}; no refits", err=True)
@@ -285,6 +241,15 @@ def fit_bases(
     gaps: Gaps = "cut" if cut_gaps else "error"
     tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
     return fit_own_bases(tables, scenarios, out, name, seed, n_refits, progress)
+
+
+def _print_checks(scenario: str, base: FittedDistribution) -> None:
+    """Print on standard error how a base and the drivers compare with what was recorded."""
+    lines = {"recorded / expected": describe_checks(map(asdict, base.checks))}
+    lines |= {who: describe_motion(found) for who, found in base.record.get("motion", {}).items()}
+    for what, text in lines.items():
+        if text:
+            typer.echo(f"{scenario}, {what}: {text}", err=True)
 
 
 def _write_base(path: Path, text: str) -> Path:

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions.coordinates import Coordinates, Difference
-from rare_envs.distributions.fitted import EventFrequency, FittedDistribution, PredictiveCheck
+from rare_envs.distributions.events import EventFrequency, PredictiveCheck
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, Parameter
@@ -47,6 +48,7 @@ from training.fit.coordinates import (
 )
 from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import COVARIANCE_FLOOR, append_independent, select_mixture
+from training.fit.motion import check_answers
 
 ATTITUDES = 6
 """Columns behind the seven of a start: standard normals, of which attention is the first."""
@@ -284,6 +286,7 @@ def fit_cut_in(
             f"{near:g}; nobody has counted changes without a look",
             "neighbours": len(neighbours.rows) if isinstance(neighbours, Neighbours) else "those of a shipped base",
         },
+        "motion": check_answers(events.joint, events.answers.reshape(-1, 2, 2)) if events.answers.size else {},
         "settings": {"covariance_floor": COVARIANCE_FLOOR, "most_components_unseen": UNSEEN_COMPONENTS, "seed": seed},
         "command": command,
         "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},

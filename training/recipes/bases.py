@@ -28,20 +28,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rare_envs.distributions.fitted import EventFrequency, FittedDistribution, join_independent
+from rare_envs.distributions.events import EventFrequency
+from rare_envs.distributions.fitted import FittedDistribution, join_independent
 from rare_envs.distributions.stratified import CutNormals
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.data.events import (
+    ANSWERS,
     braking_exposure,
     course_durations,
     find_brakings,
+    measure_answers,
     time_around_peak,
     time_between_spans,
 )
-from training.data.table import DT, SCENES_FILE, VEHICLES_FILE, read_columns
+from training.data.table import DT, NOBODY, SCENES_FILE, VEHICLES_FILE, read_columns
 from training.fit.base import fit_base, format_base
 from training.fit.coordinates import COORDINATE_SYSTEMS
 from training.fit.filters import (
@@ -82,6 +86,8 @@ MIN_JUMP, JUMP_TICKS, LEAST_PAUSE = 6.0, 3, 20
 SETTLING_TICKS, STEADY_TICKS, MAX_STEP = 8, 10, 2.0
 """Ticks from a jump to the values that are taken, as the radar takes up its new target; ticks after these in which the
 gap changes by at most so much in one [m]."""
+MOST_VEHICLES, TICK_MS = 10**6, 100
+"""Numbers of vehicles are below; milliseconds of a tick."""
 NO_LEADER = 252.0
 """Gap that stands for nobody ahead [m]."""
 
@@ -110,6 +116,8 @@ class ShippedBase:
     name: str
     events: EventRecipe | Callable[[Path], Read]
     """Columns and filters of a file in the folder of compact tables, or a function that reads them from it."""
+    answers: Callable[[Path], FloatArray] | None = None
+    """What reads how ego and cutter went on from each row of that file, (rows, 4), see `ANSWERS`."""
     changes: str | None = None
     """Site whose lane changes have the columns apart."""
     system: str | None = None
@@ -126,8 +134,12 @@ class ShippedBase:
         """Return its events from the folder of compact tables."""
         if not isinstance(self.events, EventRecipe):
             return self.events(folder)
-        box = recorded_parameters(self.scenario)
-        events = filter_events(read_events(folder / self.events.file, self.events), self.events, box)
+        box, recipe = recorded_parameters(self.scenario), self.events
+        columns = read_events(folder / recipe.file, recipe)
+        if self.answers:
+            recipe = replace(recipe, answers=ANSWERS)
+            columns |= dict(zip(ANSWERS, self.answers(folder).T, strict=True))
+        events = filter_events(columns, recipe, box)
         if self.changes:
             events = _add_changes(events, read_lane_changes(folder, self.changes), box[len(CUT_INS) :])
         return events, {}
@@ -190,6 +202,48 @@ def read_neighbours(folder: Path, site: str) -> Neighbours:
         front, cluster = rear + np.where(np.isnan(length), VEHICLE_LENGTH, length), moment // CLUSTER_FRAMES
     found, own = find_neighbours(moment, rows["lane"], rear, front, rows["speed"].astype(float))
     return keep_neighbours(CUT_IN_V1, found, np.asarray(cluster[own], dtype=np.int64), NEAR_IF_UNSEEN[site])
+
+
+def _us101_answers(folder: Path) -> FloatArray:
+    """Return how ego and cutter went on from each row of the table of cut-ins on US 101, (rows, 4)."""
+    events = read_csv_columns(folder / US101_CUT_INS.file, ("scene", "epoch_ms", "ego", "vehicle"))
+    rows = read_columns(folder / SCENES_FILE, ("scene", "vehicle", "epoch_ms", "y_along", "speed"))
+    track, ego, cutter = (
+        each["scene"].astype(np.int64) * MOST_VEHICLES + np.nan_to_num(each[who], nan=NOBODY).astype(np.int64)
+        for each, who in ((rows, "vehicle"), (events, "ego"), (events, "vehicle"))
+    )
+    moments = [each["epoch_ms"] // TICK_MS for each in (rows, events)]
+    return _find_answers(track, moments[0], rows["y_along"], rows["speed"], (ego, cutter), moments[1])
+
+
+def _i80_answers(folder: Path) -> FloatArray:
+    """Return the same of I-80."""
+    events = read_csv_columns(folder / I80_CUT_INS.file, ("frame", "ego", "vehicle"))
+    rows = read_columns(folder / COIFMAN_FILE, ("vehicle", "frame", "y_rear", "speed"))
+    who = events["ego"], events["vehicle"]
+    return _find_answers(rows["vehicle"], rows["frame"], rows["y_rear"], rows["speed"], who, events["frame"])
+
+
+def _find_answers(
+    track: NDArray[Any],
+    moment: NDArray[Any],
+    position: NDArray[Any],
+    speed: NDArray[Any],
+    wanted: Sequence[NDArray[Any]],
+    at: NDArray[Any],
+) -> FloatArray:
+    """Return what follows in wanted tracks at moments [ticks], side by side, of columns of tracks in any order."""
+    first, length = moment.min(), int(np.ptp(moment)) + 2
+    order = np.lexsort([moment, track])
+    keys = (track.astype(np.int64) * length + moment - first)[order]
+    breaks = np.append(0, 1 + np.flatnonzero(np.diff(keys) != 1))
+    found = []
+    for who in wanted:
+        key = who.astype(np.int64) * length + at - first
+        place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        row = np.where(keys[place] == key, place, NOBODY)
+        found.append(measure_answers(breaks, position[order].astype(float), speed[order].astype(float), row))
+    return np.hstack(found)
 
 
 def _read_i24_leaders(folder: Path) -> Read:
@@ -311,7 +365,7 @@ def _add_changes(events: EventSet, changes: FloatArray, box: Sequence[Any]) -> E
 
 
 _CLOSING = COORDINATE_SYSTEMS["cut_in"][2].name
-CUT_IN_SITES = (("us101", US101_CUT_INS), ("i80", I80_CUT_INS))
+CUT_IN_SITES = (("us101", US101_CUT_INS, _us101_answers), ("i80", I80_CUT_INS, _i80_answers))
 SHIPPED_BASES = (
     ShippedBase(FOLLOWING, "us101", US101_PAIRS),
     ShippedBase(FOLLOWING, "us101-gap", US101_PAIRS, system="plain"),
@@ -320,13 +374,13 @@ SHIPPED_BASES = (
     ShippedBase(FOLLOWING, "i80-all-pairs", I80_PAIRS),
     ShippedBase(FOLLOWING, "i24", _read_i24_leaders),
     *(
-        ShippedBase(CUT_IN_V1, site + ending, recipe, site, test=bool(ending))
-        for site, recipe in CUT_IN_SITES
+        ShippedBase(CUT_IN_V1, site + ending, recipe, None if ending else answers, site, test=bool(ending))
+        for site, recipe, answers in CUT_IN_SITES
         for ending in ("", "-test")
     ),
     *(
-        ShippedBase(CUT_IN_V0, site + ending, recipe, site, system)
-        for site, recipe in CUT_IN_SITES
+        ShippedBase(CUT_IN_V0, site + ending, recipe, None, site, system)
+        for site, recipe, _ in CUT_IN_SITES
         for ending, system in (("", None), ("-closing", _CLOSING))
     ),
     ShippedBase(CUT_IN_V0, "us101-15-offsets", US101_OFFSETS, system="log gaps"),

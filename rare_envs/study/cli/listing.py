@@ -14,6 +14,7 @@ from rich.text import Text
 
 import samplers
 from agents.learned.networks import HEAD_SIZE
+from rare_envs.distributions.events import describe_checks, describe_motion
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Parameter
 from rare_envs.exposure import explain_no_frequency, read_source
@@ -216,6 +217,7 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
         "no_frequency": explain_no_frequency(record),
         "checks": record.get("checks", []),
         "checked_against": record.get("checked_against"),
+        "motion": record.get("motion", {}),
     }
     if not isinstance(base, FittedDistribution):
         return known
@@ -236,7 +238,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
     """Return titles and texts of the lines of one base; empty texts where nothing is known."""
     fit = {"BIC {:,.1f}": base["bic"], "held-out log likelihood {:.2f} per event": base["held_out_log_prob"]}
     family, coordinates = base["family"] or "", base["coordinates"] or ""
-    checks = ", ".join(f"{each['name']} {each['recorded']} / {each['expected']:.3g}" for each in base["checks"])
+    checks = describe_checks(base["checks"])
     counted, known = f"not known, no rate per hour or km: {base['no_frequency']}", base["frequency"]
     if known is not None:
         counted = f"{format_rate(known['per_hour'])} per hour, {format_rate(known['per_km'])} per km: "
@@ -252,4 +254,5 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "frequency": counted,
         "counted in": (known or {}).get("source", ""),
         "recorded / expected": checks + (f" ({base['checked_against']})" if base["checked_against"] else ""),
+        **{who: describe_motion(found) for who, found in base["motion"].items()},
     }

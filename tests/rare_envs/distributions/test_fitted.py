@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.fitted import (
-    EventCounts,
-    EventFrequency,
-    FittedDistribution,
-    PredictiveCheck,
-    join_independent,
-    read_record,
-)
+from rare_envs.distributions.events import EventCounts, EventFrequency, PredictiveCheck, read_record
+from rare_envs.distributions.fitted import FittedDistribution, join_independent
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 

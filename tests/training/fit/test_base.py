@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
-from rare_envs.distributions.fitted import EventFrequency
+from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
