@@ -181,9 +181,9 @@ def describe_checks(checks: Iterable[Mapping[str, Any]]) -> str:
 
     Example:
         >>> describe_checks([{"name": "TTC < 5 s", "recorded": 7, "expected": 15.94}])
-        'TTC < 5 s 7 / 15.9'
+        'TTC < 5 s 7 / 15.94'
     """
-    return ", ".join(f"{each['name']} {each['recorded']} / {each['expected']:.3g}" for each in checks)
+    return ", ".join(f"{each['name']} {each['recorded']} / {each['expected']:.4g}" for each in checks)
 
 
 def describe_motion(found: Mapping[str, Any]) -> str:

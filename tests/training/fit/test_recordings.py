@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +64,7 @@ def test_filters_drop_and_count(tmp_path):
             ["start", *GOOD[:6], 1.2, True, "a", 12],  # faster than tyres allow
         ],
     )
-    recipe, box = EVENT_RECIPES["cut_in"], recorded_parameters("cut_in")
+    recipe, box = replace(EVENT_RECIPES["cut_in"], answers=()), recorded_parameters("cut_in")
     events = filter_events(read_events(path, recipe), recipe, box)
     points, shapes, log = events.joint, events.apart, events.log
     # speeds and gaps count even where the offset at the start was not seen or is out of range, or the duration
@@ -127,6 +128,8 @@ def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
     own = load_base(scenario_named("cut_in"), files[1])
     assert [each.name for each in own.strata] == ["unseen", "looked"]
     assert own.record["motion"]["cutters"]["events"] > 10
+    printed = capsys.readouterr().err
+    assert "cut_in, recorded / expected: looked: TTC < 2 s " in printed and "cut_in, followers: " in printed
     for scenario, file in zip(("car_following", "cut_in"), files, strict=False):
         points = load_base(scenario_named(scenario), file).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all() and 12.0 < points[:, 0].mean() < 25.0  # simulated: 9 to 27 m/s
