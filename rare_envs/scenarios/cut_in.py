@@ -249,7 +249,7 @@ class CutterModel:
         return replace(
             CUT_IN,
             parameters=(*_CUT_IN_PARAMETERS, *_DRIVER_PARAMETERS),
-            bases=base_files("cut_in_v1", "us101", "i80", "us101-test", "i80-test"),
+            bases=base_files("cut_in_v1", "us101", "i80", "us101-test"),
             initial=self.initial,
             others=self.others,
             driven=self.driven,

@@ -3,20 +3,13 @@
 Which coordinates one calls normal decides the tails, and with them the probability of a collision: for car-following
 p of the IDM is 1e-4 in plain gaps and 7e-11 in the closing speed over the root of the gap. BIC and the likelihood of
 events that the fit has not seen are what the events themselves have to say about it.
-
-A refit is the whole fit again, to events drawn anew from the recorded ones. Whole clusters are drawn with replacement
-(the bootstrap of Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 8): events of one scene depend
-on each other. Coordinates and number of components are selected anew in each refit (Breiman, "Bagging predictors",
-1996; Efron, "Estimation and accuracy after model selection", 2014). In two worlds of car-following refits in the
-coordinates of the fit gave intervals that held p in 81 and 74 % of 32 and 31 draws of events, refits that choose 96 and
-98 % of 135 and 134 (`benchmarks/uncertainty/recipe_coverage.py`).
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,21 +21,10 @@ from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
 from training.fit.filters import EventSet
 from training.fit.mixture import MAX_COMPONENTS, Candidate, Components, append_independent, select_mixture
+from training.fit.refits import FOLD_STARTS, Asked
 
 N_FOLDS = 5
 """Parts of the clusters; each is predicted from the others."""
-FOLD_STARTS = 5
-"""Starts of expectation maximisation of the fits to folds and to resampled events.
-
-Fewer than of the fit itself: another local optimum moves log p by .1 to .2, nothing beside the spread of .7 to 1.5 that
-other events cause.
-"""
-N_REFITS = 30
-"""Refits where all are of the same family: the noise of log-spread is then .13."""
-MIN_CLUSTERS = 5
-"""Clusters below which there is nothing to draw anew: refits to so few would all be alike."""
-MORE_REFITS = 100
-"""Refits where coordinates or number of components differ: one refit alone may then carry the spread."""
 BIC_TIE = 2.0
 """Difference of BIC below which it says nothing (Kass and Raftery, "Bayes factors", 1995, section 3.2)."""
 CLEARLY_WORSE = 2.0
@@ -215,40 +197,16 @@ def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters
     return max((i for i in eligible if bic[i] <= least + BIC_TIE), key=lambda i: totals[i])
 
 
-def draw_events(events: EventSet, rng: np.random.Generator) -> EventSet:
-    """Return as many clusters as there are, drawn with replacement, and columns apart drawn by themselves."""
-    names = np.unique(events.clusters)
-    rows = [np.flatnonzero(events.clusters == name) for name in rng.choice(names, len(names))]
-    labels = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
-    apart = events.apart[rng.integers(len(events.apart), size=len(events.apart))] if len(events.apart) else events.apart
-    return EventSet(events.joint[np.concatenate(rows)], labels, apart, events.cluster)
-
-
 def refit(
-    events: EventSet,
-    systems: Sequence[CoordinateSystem],
-    parameters: Sequence[Parameter],
-    seed: int = 0,
-    n: int | None = None,
-    report: Callable[[str], None] = lambda _: None,
+    events: EventSet, systems: Sequence[CoordinateSystem], parameters: Sequence[Parameter], asked: Asked
 ) -> tuple[SystemFit, ...]:
-    """Return n refits, each in the coordinate system that its events support best by the BIC; `report` is told of each.
+    """Return refits, each in the coordinate system that its events support best by the BIC."""
 
-    None: `N_REFITS`, or `MORE_REFITS` where families differ among these. There are none of under `MIN_CLUSTERS`.
-    """
-    if len(np.unique(events.clusters)) < MIN_CLUSTERS:
-        return ()
-    rng = np.random.default_rng(seed)
-    refits: list[SystemFit] = []
-    wanted = N_REFITS if n is None else n
-    while len(refits) < wanted:
-        report(f"refit {len(refits) + 1} of {wanted}")
-        drawn = draw_events(events, rng)
-        fits = [fit_system(drawn, system, parameters, seed, FOLD_STARTS) for system in systems]
-        refits.append(min(fits, key=lambda fit: fit.bic + fit.bic_apart))
-        if n is None and len(refits) == N_REFITS and len({each.family for each in refits}) > 1:
-            wanted = MORE_REFITS
-    return tuple(refits)
+    def fit(drawn: EventSet, _: np.random.Generator) -> SystemFit:
+        fits = [fit_system(drawn, system, parameters, asked.seed, FOLD_STARTS) for system in systems]
+        return min(fits, key=lambda fit: fit.bic + fit.bic_apart)
+
+    return tuple(asked.refit(events, fit, lambda each: each.family))
 
 
 def describe_family(family: str, refits: Sequence[SystemFit]) -> str:

@@ -43,7 +43,6 @@ from training.data.events import (
 from training.data.formats import load_recordings
 from training.data.table import DT, Trajectories
 from training.fit.base import fit_base, format_base
-from training.fit.coordinates import MIN_CLUSTERS
 from training.fit.filters import (
     CLUSTER_FRAMES,
     EVENT_DEFINITIONS,
@@ -52,13 +51,12 @@ from training.fit.filters import (
     read_events,
     recorded_parameters,
 )
+from training.fit.refits import MIN_CLUSTERS
 from training.fit.strata import (
     NEAR_IF_UNSEEN,
     Neighbours,
     check_starts,
     find_neighbours,
-    fit_cut_in,
-    fit_hard_brake,
     keep_neighbours,
 )
 
@@ -69,7 +67,7 @@ EXTRACTORS = {
     "hard_brake": hard_brake_events,
 }
 """Functions that extract the events of a scenario."""
-CUT_IN, HARD_BRAKE = "cut_in", "hard_brake"
+CUT_IN = "cut_in"
 LEAST_NEIGHBOURS = 500
 """Neighbours at random times that a recording of whole traffic has in its first minute."""
 TICKS_PER_SECOND = 10
@@ -192,11 +190,8 @@ def fit_own_bases(
         try:
             if scenario == CUT_IN:
                 check_starts(events)
-                others = _choose_neighbours(beside)
-                base = fit_cut_in(scenario, events, others, source, COMMAND, frequency=frequency, **asked)
-            else:
-                fit = fit_hard_brake if scenario == HARD_BRAKE else fit_base
-                base = fit(scenario, events, source, COMMAND, frequency=frequency, **asked)
+                asked["neighbours"] = _choose_neighbours(beside)
+            base = fit_base(scenario, events, source, COMMAND, frequency=frequency, **asked)
         except ValueError as error:
             too_few += 1
             words = f"{path}: {error} No base of {{}} is written"

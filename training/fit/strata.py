@@ -16,18 +16,18 @@ which leaves 1 m/s or more. A refit counts the shares of both in the clusters th
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.distributions.acceptance import AcceptedGaps
 from rare_envs.distributions.coordinates import Coordinates, Difference
 from rare_envs.distributions.events import EventFrequency, PredictiveCheck
-from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, Parameter
@@ -35,25 +35,28 @@ from rare_envs.distributions.stratified import CutNormals, StratifiedDistributio
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
-from training.fit.acceptance import fit_accepted, profile_limit
-from training.fit.coordinates import (
-    COORDINATE_SYSTEMS,
-    FOLD_STARTS,
-    MIN_CLUSTERS,
-    N_REFITS,
-    CoordinateSystem,
-    SystemFit,
-    draw_events,
-    fit_system,
+from training.fit.acceptance import LEAST_LIMIT, MOST_LIMIT, fit_accepted, profile_limit
+from training.fit.checks import (
+    BRAKING_STATES,
+    CHECK_DRAWS,
+    CUT_IN_STATES,
+    UNSEEN_STATES,
+    check_answers,
+    check_states,
 )
+from training.fit.coordinates import COORDINATE_SYSTEMS, CoordinateSystem, SystemFit, fit_system
 from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import COVARIANCE_FLOOR, append_independent, select_mixture
-from training.fit.motion import check_answers
+from training.fit.refits import FOLD_STARTS, Asked, Fit, draw_events
 
+PAIR = [0, 1, 3]
+"""Columns of a start with the speeds behind and ahead and the gap between."""
 ATTITUDES = 6
 """Columns behind the seven of a start: standard normals, of which attention is the first."""
 UNSEEN_EVENTS, UNSEEN_KM = 44, 3.219e6
 """Near-crashes of the 100-Car study at lane changes of subjects who did not see the other vehicle, and its km."""
+US101_PER_KM = 0.26
+"""Cut-ins per km on US 101."""
 NEAR_IF_UNSEEN = {"us101": 0.321, "i80": 0.429}
 """Share of changes without a look that are near-crashes, of 200,000 draws of the stratum with `human` (+- 0.001); US
 101's is the usual one."""
@@ -76,38 +79,6 @@ LEAST_KEPT = 1.0
 """Speed that is left after a braking that is none to a standstill [m/s], and range of the loss above the speed."""
 LEAST_LOSS = 3.0
 """Loss of speed from which on a braking counts [m/s]."""
-HARD_NEED = 4.9
-"""Deceleration of a rapid manoeuvre, half of gravity [m/s^2]."""
-CHECK_DRAWS = 200_000
-
-Report = Callable[[str], None]
-Check = Callable[[FloatArray, FloatArray, FloatArray], NDArray[np.bool_]]
-
-
-def needed(behind: FloatArray, ahead: FloatArray, gap: FloatArray) -> FloatArray:
-    """Return the deceleration that keeps a vehicle behind from one ahead that keeps its speed, (n,) [m/s^2]."""
-    return np.asarray(np.maximum(behind - ahead, 0.0) ** 2 / (2.0 * np.maximum(gap, 0.01)))
-
-
-CUT_IN_STATES: dict[str, Check] = {
-    **{f"TTC < {t} s": lambda v, ahead, gap, t=t: v - ahead > gap / t for t in (2, 3, 5)},  # type: ignore[misc]
-    "needed deceleration > 0.5 m/s^2": lambda v, ahead, gap: needed(v, ahead, gap) > 0.5,
-    "needed deceleration > 1 m/s^2": lambda v, ahead, gap: needed(v, ahead, gap) > 1.0,
-    "closing": lambda v, ahead, gap: v > ahead,
-    "gap < 3 m": lambda v, ahead, gap: gap < 3.0,
-}
-"""Of speed behind, speed ahead [m/s] and gap [m], (n,) each, where the cutter looked."""
-UNSEEN_STATES: dict[str, Check] = {
-    "beside": lambda v, ahead, gap: gap < 0.0,
-    "beside or needed deceleration > 4.9 m/s^2": lambda v, ahead, gap: (
-        (gap < 0.0) | (needed(v, ahead, gap) > HARD_NEED)
-    ),
-}
-BRAKING_STATES: dict[str, Check] = {
-    "time headway < 0.5 s": lambda speed, gap, peak: gap < 0.5 * speed,
-    "gap < 3 m": lambda speed, gap, peak: gap < 3.0,
-    "peak > 3 m/s^2": lambda speed, gap, peak: peak > 3.0,
-}
 
 
 def share_unseen(per_km: float, near: float) -> float:
@@ -212,113 +183,94 @@ def fit_cut_in(
     scenario: str,
     events: EventSet,
     neighbours: Neighbours | Distribution,
-    source: Mapping[str, Any],
-    command: str,
-    *,
-    frequency: EventFrequency | None = None,
-    n_refits: int | None = None,
-    seed: int = 0,
-    report: Report = lambda _: None,
-) -> FittedDistribution:
-    """Return a base of `CutIn-v1` with its two strata.
+    frequency: EventFrequency | None,
+    asked: Asked,
+) -> Fit:
+    """Return cut-ins of `CutIn-v1` with both strata.
 
-    Args:
-        scenario: Short name or environment id.
-        events: Starts of recorded cut-ins, with offset and duration apart.
-        neighbours: At random times; or a base made of strata, whose `unseen` is taken where there are none.
-        source: Site, data, publisher, licence and so on, for the file.
-        command: Command that writes the file.
-        frequency: Of cut-ins; None where nobody counted: then the share of those who do not look is that of US 101's.
-        n_refits: Number of refits.
-        seed: Of fits and refits.
-        report: Told of each.
-
-    Raises:
-        ValueError: The events are too few.
+    The events are starts of recorded cut-ins, with offset and duration apart. Where nobody counted how frequent they
+    are, the share of those who do not look is that of US 101's. A ValueError if the events are too few.
     """
     check_starts(events)
     box = recorded_parameters(scenario)
-    wide = recorded_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)
-    own = isinstance(neighbours, Neighbours)
     near = neighbours.near if isinstance(neighbours, Neighbours) else NEAR_IF_UNSEEN["us101"]
-    share = share_unseen(frequency.per_km if frequency else 0.26, near)
-    taken = () if own else (neighbours, *getattr(neighbours, "refits", ()))
+    share = share_unseen(frequency.per_km if frequency else US101_PER_KM, near)
+    find_unseen = _unseen_finder(scenario, neighbours, asked.seed)
 
-    def fit_both(drawn: EventSet, k: int, w: float, rng: np.random.Generator) -> Any:
-        accepted = fit_accepted(drawn.joint, drawn.apart, box)
-        if isinstance(neighbours, Neighbours):
-            rows = neighbours.events if k < 0 else draw_events(neighbours.events, rng)
-            unseen: Any = _fit_unseen(rows, drawn.apart, wide, seed, UNSEEN_STARTS if k >= 0 else None)
-        else:
-            unseen = taken[(k + 1) % len(taken)].strata[0].base.blocks[0]
-        return _join_drivers(accepted, unseen, w)
+    def fit(drawn: EventSet, rng: np.random.Generator | None) -> StratifiedDistribution:
+        own = share if rng is None else min(share * math.exp(UNSEEN_LOG_SD * rng.standard_normal()), 0.5)
+        return _join_drivers(fit_accepted(drawn.joint, drawn.apart, box), find_unseen(drawn.apart, rng), own)
 
-    rng = np.random.default_rng(seed)
-    report("fit")
-    fitted = fit_both(events, -1, share, rng)
-    refits = []
-    wanted = 0 if len(np.unique(events.clusters)) < MIN_CLUSTERS else N_REFITS if n_refits is None else n_refits
-    for k in range(wanted):
-        report(f"refit {k + 1} of {wanted}")
-        drawn = draw_events(events, rng)
-        w = min(share * math.exp(UNSEEN_LOG_SD * rng.standard_normal()), 0.5)
-        refits.append(fit_both(drawn, k, w, rng))
-    ego, cutter, _, gap, _ = events.joint.T
-    looked, unseen = fitted.strata[1].base.blocks[0], fitted.strata[0].base.blocks[0]
-    k = len(unseen.weights)
-    record = {
-        "kind": "fitted to recorded events",
-        "coordinates": "closing speed, log gaps, log duration; accepted behind",
-        "source": dict(source),
-        "filters": list(events.log),
-        "accepted": {
-            "limit": looked.limit,
-            "limits_of_refits": [each.strata[1].base.blocks[0].limit for each in refits],
-            "log_likelihood_over_none": profile_limit(ego - cutter, gap, (box[3].low, box[3].high)),
-            "share_of_offers": float(f"{math.exp(looked.log_share):.4g}"),
-            "limit_from_to": [0.1, 20.0],
-        },
-        "unseen": {
-            "share": fitted.strata[0].share,
-            "log_sd": round(UNSEEN_LOG_SD, 3),
-            "rests_on": "44 near-crashes of the 100-Car study (3.219e6 km) at own lane changes of drivers who did not "
-            "see the other vehicle, over cut-ins per km and the simulated share of near-crashes among such changes, "
-            f"{near:g}; nobody has counted changes without a look",
-            "neighbours": len(neighbours.rows) if isinstance(neighbours, Neighbours) else "those of a shipped base",
-        },
-        "motion": check_answers(events.joint, events.answers.reshape(-1, 2, 2)) if events.answers.size else {},
-        "settings": {"covariance_floor": COVARIANCE_FLOOR, "most_components_unseen": UNSEEN_COMPONENTS, "seed": seed},
-        "command": command,
-        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
-    }
-    checks = _check_pairs("looked", CUT_IN_STATES, events.joint[:, [0, 1, 3]], looked, (0, 1, 3), seed)
+    asked.report("fit")
+    fitted, refits = fit(events, None), asked.refit(events, fit)
+    bases: list[tuple[Any, Any]] = [tuple(part.base.blocks[0] for part in each.strata) for each in (fitted, *refits)]
+    (unseen, looked), limits = bases[0], [accepted.limit for _, accepted in bases[1:]]
+    checks = check_states(CUT_IN_STATES, "looked: {}", events.joint[:, PAIR], _draw_pairs(looked, asked.seed))
     if isinstance(neighbours, Neighbours):
-        checks += _check_pairs("unseen", UNSEEN_STATES, neighbours.rows[:, [0, 1, 3]], unseen, (0, 1, 3), seed)
-    plural = "s" if k > 1 else ""
-    return FittedDistribution(
+        checks += check_states(UNSEEN_STATES, "unseen: {}", neighbours.rows[:, PAIR], _draw_pairs(unseen, asked.seed))
+    k = len(unseen.weights)
+    return Fit(
         distribution=fitted,
         refits=tuple(refits),
-        events=events.counts,
-        family=f"accepted gaps (b = {looked.limit:g} m/s^2); unseen: {k} component{plural} of neighbours",
-        frequency=frequency,
+        family=f"accepted gaps (b = {looked.limit:g} m/s^2); unseen: {k} component{'s' * (k > 1)} of neighbours",
         checks=checks,
-        record=record,
+        criteria={"coordinates": "closing speed, log gaps, log duration; accepted behind"},
+        entries={
+            "accepted": _describe_accepted(events, looked, limits, box[3]),
+            "unseen": _describe_unseen(fitted.strata[0].share, neighbours, near),
+            "motion": check_answers(events.joint, events.answers.reshape(-1, 2, 2)) if events.answers.size else {},
+        },
+        settings={"covariance_floor": COVARIANCE_FLOOR, "most_components_unseen": UNSEEN_COMPONENTS},
     )
 
 
-def _check_pairs(
-    what: str, states: Mapping[str, Check], recorded: FloatArray, base: Any, columns: Sequence[int], seed: int
-) -> tuple[PredictiveCheck, ...]:
-    """Return recorded and expected counts of states of rows (n, 3), the columns of draws of a base."""
-    drawn = base.sample(CHECK_DRAWS, np.random.default_rng(seed))[:, list(columns)]
-    return tuple(
-        PredictiveCheck(
-            f"{what}: {name}",
-            int(occurs(*recorded.T).sum()),
-            float(f"{float(occurs(*drawn.T).mean()) * len(recorded):.3g}"),
-        )
-        for name, occurs in states.items()
-    )
+def _unseen_finder(scenario: str, neighbours: Neighbours | Distribution, seed: int) -> Callable[..., Any]:
+    """Return what gives the mixture of neighbours with columns apart: fitted, to all or for a refit to some; or taken.
+
+    A base that has strata gives its own, and those of its refits in their order.
+    """
+    if isinstance(neighbours, Neighbours):
+        wide = recorded_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)
+        events = neighbours.events
+
+        def find(apart: FloatArray, rng: np.random.Generator | None) -> TruncatedGaussianMixture:
+            if rng is None:
+                return _fit_unseen(events, apart, wide, seed, None)
+            return _fit_unseen(draw_events(events, rng), apart, wide, seed, UNSEEN_STARTS)
+
+        return find
+    given: Any = neighbours
+    taken = itertools.cycle((given, *getattr(given, "refits", ())))
+    return lambda apart, rng: next(taken).strata[0].base.blocks[0]
+
+
+def _describe_accepted(events: EventSet, looked: AcceptedGaps, limits: list[float], gap: Parameter) -> dict[str, Any]:
+    """Return what the record says of the gaps that drivers accept."""
+    ego, cutter, _, behind, _ = events.joint.T
+    return {
+        "limit": looked.limit,
+        "limits_of_refits": limits,
+        "log_likelihood_over_none": profile_limit(ego - cutter, behind, (gap.low, gap.high)),
+        "share_of_offers": float(f"{math.exp(looked.log_share):.4g}"),
+        "limit_from_to": [LEAST_LIMIT, MOST_LIMIT],
+    }
+
+
+def _describe_unseen(share: float, neighbours: Neighbours | Distribution, near: float) -> dict[str, Any]:
+    """Return what the record says of those who do not look."""
+    return {
+        "share": share,
+        "log_sd": round(UNSEEN_LOG_SD, 3),
+        "rests_on": "44 near-crashes of the 100-Car study (3.219e6 km) at own lane changes of drivers who did not "
+        "see the other vehicle, over cut-ins per km and the simulated share of near-crashes among such changes, "
+        f"{near:g}; nobody has counted changes without a look",
+        "neighbours": len(neighbours.rows) if isinstance(neighbours, Neighbours) else "those of a shipped base",
+    }
+
+
+def _draw_pairs(base: Any, seed: int) -> FloatArray:
+    """Return speeds behind and ahead and the gap of draws of a base, (m, 3)."""
+    return np.asarray(base.sample(CHECK_DRAWS, np.random.default_rng(seed))[:, PAIR])
 
 
 def _with_loss(stop: TruncatedGaussianMixture, parameters: Sequence[Parameter]) -> TruncatedGaussianMixture:
@@ -345,94 +297,79 @@ def _slowing_system(system: CoordinateSystem, speed: Parameter) -> CoordinateSys
     return CoordinateSystem(f"{system.name}, log loss", kinds, ("loss", "speed", "gap", "peak"), (kept,))
 
 
-def fit_hard_brake(
-    scenario: str,
-    events: EventSet,
-    source: Mapping[str, Any],
-    command: str,
-    *,
-    frequency: EventFrequency | None = None,
-    n_refits: int | None = None,
-    seed: int = 0,
-    report: Report = lambda _: None,
-) -> FittedDistribution:
-    """Return a base of `HardBrake-v0` with its strata, of brakings: speed, gap, peak and loss, (n, 4).
+class _Brakings(NamedTuple):
+    """What brakings are fitted to: one stratum."""
 
-    The loss of a braking to a standstill is the speed. Arguments and errors are as those of `fit_cut_in`.
-    """
-    parameters = tuple(scenario_named(scenario).parameters)
+    name: str
+    events: EventSet
+    systems: Sequence[CoordinateSystem]
+    box: Sequence[Parameter]
+
+
+def _split_brakings(events: EventSet, parameters: Sequence[Parameter]) -> list[_Brakings]:
+    """Return brakings that leave some speed, and those to a standstill, without their loss."""
+    speed, loss = events.joint[:, 0], events.joint[:, 3]
+    stops, labels = loss > speed - LEAST_KEPT, events.clusters
     narrow = (
         replace(parameters[0], low=LEAST_LOSS + LEAST_KEPT),
         *parameters[1:3],
         replace(parameters[3], low=LEAST_LOSS, high=parameters[0].high - LEAST_KEPT),
     )
     systems = COORDINATE_SYSTEMS["hard_brake"]
-    slowing_systems = [_slowing_system(each, parameters[0]) for each in systems]
+    others = [_slowing_system(each, parameters[0]) for each in systems]
+    slowing = EventSet(events.joint[~stops], labels[~stops])
+    stop = EventSet(events.joint[stops, :3], labels[stops])
+    return [_Brakings("slowing", slowing, others, narrow), _Brakings("stop", stop, systems, parameters[:3])]
 
-    def split(drawn: EventSet) -> tuple[EventSet, EventSet]:
-        speed, loss = drawn.joint[:, 0], drawn.joint[:, 3]
-        stops = loss > speed - LEAST_KEPT
-        labels = drawn.clusters
-        return EventSet(drawn.joint[stops, :3], labels[stops]), EventSet(drawn.joint[~stops], labels[~stops])
 
-    def fit_all(drawn: EventSet, starts: int | None) -> tuple[StratifiedDistribution, dict[str, SystemFit]]:
-        stop, slowing = split(drawn)
-        if max(len(stop.joint), len(slowing.joint)) < LEAST_BRAKINGS:
-            raise ValueError(f"{len(drawn.joint)} events are too few; {LEAST_BRAKINGS} of a stratum are needed.")
-        share = float(f"{len(stop.joint) / len(drawn.joint):.6g}")
-        best: dict[str, SystemFit] = {}
-        strata = []
-        for name, some, own, box, w in (
-            ("slowing", slowing, slowing_systems, narrow, 1.0 - share),
-            ("stop", stop, systems, parameters[:3], share),
-        ):
-            if len(some.joint) >= LEAST_BRAKINGS:
-                fits = [fit_system(some, each, box, seed, starts) for each in own]
-                best[name] = min(fits, key=lambda fit: fit.bic)
-                base = best[name].distribution
-                strata.append(Stratum(name, w, _with_loss(base, parameters) if name == "stop" else base))
-        if len(strata) == 1:
-            strata = [strata[0]._replace(share=1.0)]
+def fit_hard_brake(scenario: str, events: EventSet, asked: Asked) -> Fit:
+    """Return brakings of `HardBrake-v0` with both strata, of events with speed, gap, peak and loss, (n, 4).
+
+    The loss of a braking to a standstill is the speed. A stratum of too few brakings is left out; a ValueError if both
+    are.
+    """
+    parameters = tuple(scenario_named(scenario).parameters)
+    split = _split_brakings(events, parameters)
+    kept = [each.name for each in split if len(each.events.joint) >= LEAST_BRAKINGS]
+    if not kept:
+        raise ValueError(f"{len(events.joint)} events are too few; {LEAST_BRAKINGS} of a stratum are needed.")
+
+    def fit(drawn: EventSet, starts: int | None) -> tuple[StratifiedDistribution, list[SystemFit]] | None:
+        parts = [each for each in _split_brakings(drawn, parameters) if each.name in kept]
+        if min(len(part.events.joint) for part in parts) < LEAST_BRAKINGS:
+            return None
+        total = sum(len(part.events.joint) for part in parts)
+        best, strata = list[SystemFit](), list[Stratum]()
+        stop = float(f"{len(parts[-1].events.joint) / total:.6g}")
+        for part, share in zip(parts, (1.0 - stop, stop) if len(parts) > 1 else (1.0,), strict=True):
+            fits = [fit_system(part.events, each, part.box, asked.seed, starts) for each in part.systems]
+            best.append(min(fits, key=lambda each: each.bic))
+            base = best[-1].distribution
+            strata.append(Stratum(part.name, share, _with_loss(base, parameters) if part.name == "stop" else base))
         return StratifiedDistribution(tuple(strata), np.zeros(len(strata) - 1), column=3, less=0), best
 
-    report("fit")
-    fitted, best = fit_all(events, None)
-    rng, refits = np.random.default_rng(seed), list[StratifiedDistribution]()
-    wanted = 0 if len(np.unique(events.clusters)) < MIN_CLUSTERS else N_REFITS if n_refits is None else n_refits
-    while len(refits) < wanted:
-        report(f"refit {len(refits) + 1} of {wanted}")
-        drawn = draw_events(events, rng)
-        one = fit_all(drawn, FOLD_STARTS)[0] if min(_sizes(split(drawn), best)) >= LEAST_BRAKINGS else None
-        if one is not None:
-            refits.append(one)
-    stop, slowing = split(events)
+    def refit(drawn: EventSet, _: np.random.Generator) -> StratifiedDistribution | None:
+        found = fit(drawn, FOLD_STARTS)
+        return None if found is None else found[0]
+
+    asked.report("fit")
+    fitted, best = cast(tuple[StratifiedDistribution, list[SystemFit]], fit(events, None))
     checks: tuple[PredictiveCheck, ...] = ()
-    for name, _, base in fitted.strata:
-        own = stop if name == "stop" else slowing
-        checks += _check_pairs(name, BRAKING_STATES, own.joint[:, :3], base, (0, 1, 2), seed)
-    family = "; ".join(f"{name}: {fit.family}" for name, fit in best.items())
-    record = {
-        "kind": "fitted to recorded events",
-        "coordinates": "; ".join(f"{name}: {fit.system.name}" for name, fit in best.items()),
-        "bic": round(sum(fit.bic for fit in best.values()), 2),
-        "source": dict(source),
-        "filters": list(events.log),
-        "strata": {"stop": len(stop.joint), "slowing": len(slowing.joint)},
-        "settings": {"covariance_floor": COVARIANCE_FLOOR, "seed": seed},
-        "command": command,
-        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
-    }
-    return FittedDistribution(
+    for part in split:
+        for name, _, base in fitted.strata:
+            if name == part.name:
+                drawn = base.sample(CHECK_DRAWS, np.random.default_rng(asked.seed))[:, :3]
+                checks += check_states(BRAKING_STATES, f"{name}: {{}}", part.events.joint[:, :3], drawn)
+    pairs = list(zip(kept, best, strict=True))
+    return Fit(
         distribution=fitted,
-        refits=tuple(refits),
-        events=events.counts,
-        family=family,
-        frequency=frequency,
+        refits=tuple(asked.refit(events, refit)),
+        family="; ".join(f"{name}: {each.family}" for name, each in pairs),
         checks=checks,
-        record=record,
+        criteria={
+            "coordinates": "; ".join(f"{name}: {each.system.name}" for name, each in pairs),
+            "bic": round(sum(each.bic for each in best), 2),
+        },
+        entries={"strata": {each.name: len(each.events.joint) for each in reversed(split)}},
+        settings={"covariance_floor": COVARIANCE_FLOOR},
     )
-
-
-def _sizes(parts: tuple[EventSet, EventSet], kept: Mapping[str, Any]) -> list[int]:
-    """Return the numbers of brakings of strata that are kept, of those to a standstill and of others."""
-    return [len(part.joint) for part, name in zip(parts, ("stop", "slowing"), strict=True) if name in kept]

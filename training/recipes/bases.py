@@ -67,8 +67,6 @@ from training.fit.strata import (
     NEAR_IF_UNSEEN,
     Neighbours,
     find_neighbours,
-    fit_cut_in,
-    fit_hard_brake,
     keep_neighbours,
 )
 
@@ -162,14 +160,10 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
     events, counted = base.read(data)
     frequency = None if known is None else replace(EventFrequency(**known), **counted)
     asked: dict[str, Any] = {"frequency": frequency, "n_refits": n_refits, "seed": seed}
-    if base.scenario == BRAKING:
-        fitted = fit_hard_brake(BRAKING, events, source, COMMAND, **asked)
-    elif base.scenario == CUT_IN_V1 and not base.test:
-        neighbours = read_neighbours(data, str(base.changes))
-        fitted = fit_cut_in(CUT_IN_V1, events, neighbours, source, COMMAND, **asked)
-    else:
-        fitted = fit_base(base.scenario, events, source, COMMAND, system=base.system, **asked)
-        fitted = _add_attitudes(fitted) if base.test else fitted
+    stratified = base.scenario == CUT_IN_V1 and not base.test
+    asked["neighbours"] = read_neighbours(data, str(base.changes)) if stratified else None
+    fitted = fit_base(base.scenario, events, source, COMMAND, system=base.system, **asked)
+    fitted = _add_attitudes(fitted) if base.test else fitted
     return format_base(base.scenario, fitted.to_dict())
 
 
@@ -373,11 +367,8 @@ SHIPPED_BASES = (
     ShippedBase(FOLLOWING, "i80", replace(I80_PAIRS, excluded=("at_entry",))),
     ShippedBase(FOLLOWING, "i80-all-pairs", I80_PAIRS),
     ShippedBase(FOLLOWING, "i24", _read_i24_leaders),
-    *(
-        ShippedBase(CUT_IN_V1, site + ending, recipe, None if ending else answers, site, test=bool(ending))
-        for site, recipe, answers in CUT_IN_SITES
-        for ending in ("", "-test")
-    ),
+    *(ShippedBase(CUT_IN_V1, site, recipe, answers, site) for site, recipe, answers in CUT_IN_SITES),
+    ShippedBase(CUT_IN_V1, "us101-test", US101_CUT_INS, changes="us101", test=True),
     *(
         ShippedBase(CUT_IN_V0, site + ending, recipe, None, site, system)
         for site, recipe, _ in CUT_IN_SITES

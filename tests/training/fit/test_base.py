@@ -11,7 +11,8 @@ from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
-from training.fit.base import CHECK_DRAWS, check_predictions, fit_base, format_base, mass_outside
+from training.fit.base import fit_base, format_base
+from training.fit.checks import CHECK_DRAWS, check_predictions, mass_outside
 from training.fit.filters import EventSet
 
 FREQUENCY = EventFrequency(count=60, hours=6.0, km=200.0, definition="a pair begins", source="made up")

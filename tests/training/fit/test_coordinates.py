@@ -10,18 +10,18 @@ from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from training.fit import coordinates as module
 from training.fit import mixture as mixture_fit
+from training.fit import refits
 from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
-    FOLD_STARTS,
     SYSTEMS_APART,
     choose_system,
-    draw_events,
     fit_system,
     held_out_log_prob,
     refit,
 )
 from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import EM_ITERATIONS, SMALLEST_COMPONENT, TOLERANCE, fit_mixture, select_mixture
+from training.fit.refits import FOLD_STARTS, Asked, draw_events
 
 
 def test_a_component_on_a_handful_of_events_is_rejected(quick):
@@ -159,8 +159,8 @@ def events(n, seed=0, per_cluster=1):
 
 
 def test_more_refits_where_the_number_of_components_differs(monkeypatch):
-    monkeypatch.setattr(module, "N_REFITS", 4)
-    monkeypatch.setattr(module, "MORE_REFITS", 7)
+    monkeypatch.setattr(refits, "N_REFITS", 4)
+    monkeypatch.setattr(refits, "MORE_REFITS", 7)
     for numbers, wanted in (([1, 1, 1, 1], 4), ([1, 2, 1, 1, 1, 1, 1], 7)):
         made = iter(numbers)
 
@@ -168,7 +168,7 @@ def test_more_refits_where_the_number_of_components_differs(monkeypatch):
             return SimpleNamespace(family=f"{next(made)} components", bic=0.0, bic_apart=0.0)
 
         monkeypatch.setattr(module, "fit_system", fit)
-        families = [each.family for each in refit(events(25), [LOG_GAP], FOLLOWING)]
+        families = [each.family for each in refit(events(25), [LOG_GAP], FOLLOWING, Asked())]
         assert families == [f"{number} components" for number in numbers[:wanted]]
 
 
@@ -176,7 +176,7 @@ def test_more_refits_where_the_number_of_components_differs(monkeypatch):
 def test_coordinates_are_chosen_anew_in_each_refit(quick):
     """By the BIC of the events drawn; 400 events of logarithms of gaps leave no doubt."""
     systems = COORDINATE_SYSTEMS["car_following"][:2]
-    few, many = (refit(events(n, seed=1), systems, FOLLOWING, n=6) for n in (25, 400))
+    few, many = (refit(events(n, seed=1), systems, FOLLOWING, Asked(6)) for n in (25, 400))
     assert {each.system.name for each in many} == {"log gap"}
     drawn = draw_events(events(25, seed=1), np.random.default_rng(0))
     criteria = [fit_system(drawn, system, FOLLOWING, 0, FOLD_STARTS).bic for system in systems]
@@ -186,11 +186,11 @@ def test_coordinates_are_chosen_anew_in_each_refit(quick):
 
 def test_refits_follow_the_seed_and_few_clusters_have_none(quick):
     told = []
-    one = refit(events(30), [LOG_GAP], FOLLOWING, seed=3, n=3, report=told.append)
-    other = refit(events(30), [LOG_GAP], FOLLOWING, seed=3, n=3)
+    one = refit(events(30), [LOG_GAP], FOLLOWING, Asked(3, 3, told.append))
+    other = refit(events(30), [LOG_GAP], FOLLOWING, Asked(3, 3))
     assert [fit.distribution.to_dict() for fit in one] == [fit.distribution.to_dict() for fit in other]
     assert told == [f"refit {number} of 3" for number in (1, 2, 3)]
-    assert refit(events(40, per_cluster=10), [LOG_GAP], FOLLOWING) == ()
+    assert refit(events(40, per_cluster=10), [LOG_GAP], FOLLOWING, Asked()) == ()
 
 
 def test_clusters_are_drawn_whole_and_columns_apart_by_themselves():

@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import training.fit.motion as motion
+import training.fit.checks as checks
 from rare_envs.scenarios.cut_in import CUTTER_IDM, CutterModel
 from rare_envs.scenarios.registry import SCENARIOS
 from tests.training.shared_data import DATA, needs_data
 from training.data.events import ANSWERS, cut_in_events, measure_answer
 from training.data.table import synthetic_traffic
-from training.fit.motion import check_answers, simulate_answers
+from training.fit.checks import check_answers, simulate_answers
 from training.recipes.bases import SHIPPED_BASES
 
 SITES = {each.name: each for each in SHIPPED_BASES if each.answers}
@@ -50,7 +50,7 @@ def test_drivers_go_on_as_recorded_ones_did(site, followers, cutters):
 def test_the_script_that_brakes_for_its_lead_is_refuted(site, monkeypatch):
     """Root mean square error of the cutter of `CutIn-v0`: 1.31 and 0.94 m/s^2."""
     monkeypatch.setitem(SCENARIOS, "rare_envs/CutIn-v1", CutterModel(idm=CUTTER_IDM, coolness=None).scenario())
-    monkeypatch.setattr(motion, "DRAWS", 1)
+    monkeypatch.setattr(checks, "DRAWS", 1)
     assert check_answers(*read_site(site))["cutters"]["rmse"] > 0.75
 
 
@@ -78,4 +78,4 @@ def test_followers_brake_hard_where_they_must_and_not_where_nothing_closes():
     near, far = simulate_answers(np.array([[20.0, 12.0, 12.0, 10.0, 40.0], [20.0, 20.0, 20.0, 60.0, 60.0]]), 4)[
         :, :, 0, 1
     ].T
-    assert (near > motion.HARD_BRAKING).all() and (far < 1.0).all()
+    assert (near > checks.HARD_BRAKING).all() and (far < 1.0).all()
