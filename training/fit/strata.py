@@ -203,8 +203,7 @@ def fit_cut_in(
 
     asked.report("fit")
     fitted, refits = fit(events, None), asked.refit(events, fit)
-    bases: list[tuple[Any, Any]] = [tuple(part.base.blocks[0] for part in each.strata) for each in (fitted, *refits)]
-    (unseen, looked), limits = bases[0], [accepted.limit for _, accepted in bases[1:]]
+    (unseen, looked), *others = (_starts_of(each) for each in (fitted, *refits))
     checks = check_states(CUT_IN_STATES, "looked: {}", events.joint[:, PAIR], _draw_pairs(looked, asked.seed))
     if isinstance(neighbours, Neighbours):
         checks += check_states(UNSEEN_STATES, "unseen: {}", neighbours.rows[:, PAIR], _draw_pairs(unseen, asked.seed))
@@ -216,7 +215,7 @@ def fit_cut_in(
         checks=checks,
         criteria={"coordinates": "closing speed, log gaps, log duration; accepted behind"},
         entries={
-            "accepted": _describe_accepted(events, looked, limits, box[3]),
+            "accepted": _describe_accepted(events, looked, [each.limit for _, each in others], box[3]),
             "unseen": _describe_unseen(fitted.strata[0].share, neighbours, near),
             "motion": check_answers(events.joint, events.answers.reshape(-1, 2, 2)) if events.answers.size else {},
         },
@@ -242,6 +241,12 @@ def _unseen_finder(scenario: str, neighbours: Neighbours | Distribution, seed: i
     given: Any = neighbours
     taken = itertools.cycle((given, *getattr(given, "refits", ())))
     return lambda apart, rng: next(taken).strata[0].base.blocks[0]
+
+
+def _starts_of(fitted: StratifiedDistribution) -> tuple[Any, Any]:
+    """Return the distributions of starts of those who do not look, and of those who do."""
+    unseen, looked = (cast(Any, each.base).blocks[0] for each in fitted.strata)
+    return unseen, looked
 
 
 def _describe_accepted(events: EventSet, looked: AcceptedGaps, limits: list[float], gap: Parameter) -> dict[str, Any]:

@@ -130,6 +130,27 @@ def test_what_drivers_accept_is_supported_by_the_recorded_starts():
         assert np.std(np.log(record["limits_of_refits"])) > 0.05
 
 
+def describe_starts(starts):
+    """Share that closes, upper quartile and ninth decile of 1 / TTC, and share of TTC under 5 s; (..., n, 4)."""
+    inverse = (starts[..., 0] - starts[..., 1]) / starts[..., 3]
+    return [(inverse > 0.0).mean(-1), *np.quantile(inverse, (0.75, 0.9), axis=-1), (inverse > 0.2).mean(-1)]
+
+
+@needs_data("us101_cut_in_events.csv", "i80_coifman.parquet")
+@pytest.mark.parametrize(("site", "other"), [("us101", "i80"), ("i80", "us101")])
+def test_starts_at_a_site_that_was_not_used_are_as_the_refits_expect(site, other):
+    """As many draws of each of 30 refits as there are starts, 20 times: positions from .05 to .998 measured."""
+    recorded = next(each for each in SHIPPED_BASES if each.answers and each.name == other).read(DATA)[0].joint
+    rng, found = np.random.default_rng(0), []
+    for each in load_base(scenario_named("rare_envs/CutIn-v1"), site).refits:
+        drawn = each.strata[1].base.sample(20 * len(recorded), rng)
+        found.append(describe_starts(drawn.reshape(20, len(recorded), -1)))
+    found, wanted = np.concatenate(found, axis=1), np.array(describe_starts(recorded))[:, None]
+    position = (found < wanted).mean(axis=1) + 0.5 * (found == wanted).mean(axis=1)
+    assert ((position > 0.001) & (position < 0.999)).all()
+    assert np.median(np.abs(position - 0.5)) < 0.475
+
+
 def test_new_leaders_are_jumps_of_the_gap_that_stay():
     """The gaps of so many ticks each, and those of the new leaders."""
     for gaps, expected in (
