@@ -1,18 +1,19 @@
-"""How often does each ego crash in each scenario, by two methods, and what is its likeliest crash?
+"""How often does each ego crash in each scenario, and what is its likeliest crash?
 
     python -m benchmarks.driving.egos
 
-trains a PPO and a DQN ego in each scenario as `rare-envs train-ego` does, unless they are there already, asks
-`TwoStage` and `AdaptiveSubsetSimulation` about every ego in every scenario, and writes
-benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
-vision,ppo`. The rows of `CutIn-v1` and `HardBrake-v0` come by
+trains a PPO and a DQN ego in each scenario as `rare-envs train-ego` does, unless they are there already, asks the
+default method about every ego in every scenario, and writes benchmarks/results/egos.json: searches where failures are
+rare, plain draws in strata where they are not, and in compiled ones that did not fail at all. What that file has is not
+simulated again, but for the egos that are named: `--only vision,ppo`. An ego that takes a quarter of a second for a
+simulation is asked by plain draws:
 
-    python -m benchmarks.driving.egos --env HardBrake-v0 --only idm,ppo,dqn --steps 100000 --methods two-stage \
-        --at-most 20000
+    python -m benchmarks.driving.egos --env HardBrake-v0 --only vision --method mc --at-most 300
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +33,7 @@ STEPS = 400_000
 TRAINED = ("ppo", "dqn")
 """Egos that are trained here."""
 EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")
-METHODS = ("two-stage", "adss")
+METHOD = "auto"
 BASES = {"rare_envs/CarFollowing-v0": "us101-gap"}
 """Base distributions in place of the default, where collisions are too rare under that to compare egos."""
 MOST = {"vision": 1500}
@@ -53,10 +54,12 @@ class EgoResult:
     seconds: float
     """Wall time."""
     warnings: tuple[str, ...]
-    words: str = ""
-    """The likeliest failure; empty for all methods but the first."""
+    words: str
+    """The likeliest failure."""
     steps: int = 0
     """Environment steps of the ego's training; 0 for an ego that is not trained here."""
+    parts: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """By stratum of the base distribution: p in it, and the ends of its interval; empty where there are no strata."""
 
 
 def version_of(env_id: str) -> str:
@@ -71,7 +74,7 @@ def train_cached(algo: str, env_id: str, steps: int, folder: Path) -> Path:
 
 
 def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, at_most: int | None = None) -> EgoResult:
-    """Estimate, and name the likeliest failure that the first of `METHODS` has found.
+    """Estimate, and name the likeliest failure found.
 
     Args:
         env_id: The scenario.
@@ -100,8 +103,9 @@ def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, at_
         n_sim=estimate.n_sim,
         seconds=report.seconds,
         warnings=estimate.warnings,
-        words=describe_likeliest(report) if method == METHODS[0] else "",
+        words=describe_likeliest(report),
         steps=steps if trained else 0,
+        parts={part.name: (part.p, *part.interval) for part in estimate.parts},
     )
 
 
@@ -114,14 +118,23 @@ def describe_likeliest(report: Report) -> str:
     return "no crash" if crash is None else f"{crash['kind']}, {crash['closing_speed']:.1f} m/s"
 
 
-def read_results() -> dict[tuple[str, str, str], EgoResult]:
-    """Return what has been measured so far, by scenario, ego and method."""
+def read_results() -> dict[tuple[str, str], EgoResult]:
+    """Return what has been measured so far, by scenario and ego, scenarios in their order."""
     cells = json.loads(EGOS_RESULT.read_text())["cells"] if EGOS_RESULT.exists() else []
-    found = [EgoResult(**{**cell, "warnings": tuple(cell["warnings"])}) for cell in cells]
-    return {(cell.env_id, cell.ego, cell.method): cell for cell in found}
+    found = {
+        (cell["env_id"], cell["ego"]): EgoResult(
+            **{
+                **cell,
+                "warnings": tuple(cell["warnings"]),
+                "parts": {name: tuple(part) for name, part in cell["parts"].items()},
+            }
+        )
+        for cell in cells
+    }
+    return {key: found[key] for key in product(SCENARIOS, EGOS) if key in found}
 
 
-def write_results(cells: dict[tuple[str, str, str], EgoResult]) -> None:
+def write_results(cells: dict[tuple[str, str], EgoResult]) -> None:
     """Write what has been measured."""
     versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__}
     about = {"command": "python -m benchmarks.driving.egos", "versions": versions}
@@ -134,16 +147,16 @@ def main(
     only: Annotated[str, typer.Option(help="Egos to measure anew, with commas between; all that are not yet.")] = "",
     env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
     steps: Annotated[int, typer.Option(help="Of the training of an ego.")] = STEPS,
-    methods: Annotated[str, typer.Option(help="With commas between.")] = ",".join(METHODS),
+    method: Annotated[str, typer.Option(help="Name of the method.")] = METHOD,
     at_most: Annotated[int | None, typer.Option(min=1, help="Simulations of a run; usually what MOST has.")] = None,
 ) -> None:
     """Measure what is not measured yet."""
     chosen = only.split(",") if only else []
     measured = {key for key, cell in read_results().items() if cell.ego not in chosen or env not in cell.env_id}
-    for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in EGOS for method in methods.split(",")]:
+    for key in product(SCENARIOS, EGOS):
         if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
             continue
-        cell = evaluate_ego(*key, steps=steps, runs=runs, at_most=at_most)
+        cell = evaluate_ego(*key, method, steps=steps, runs=runs, at_most=at_most)
         print(cell, flush=True)
         write_results({**read_results(), key: cell})  # read anew: another process may measure other egos
 

@@ -75,7 +75,7 @@ class DensePolicy:
     def decide(self, observation: Tensor) -> Tensor:
         """Return mean actions (B, 2) for observations (B, F), clipped, not finite where they are; all on its device."""
         assert self.clip is not None
-        values = observation.float()
+        values = observation.float().flatten(1)  # rows of HighwayEnv's kinematics, one for each vehicle
         for weights, biases in self._doubled[:-1]:
             values = _APPLIED[self.activation](linear(values, weights, biases))
         actions = linear(values, *self._doubled[-1])

@@ -24,8 +24,9 @@ class Careful(PPO):
         return np.full_like(action, -1.0), state
 
 
-def make(algorithm=PPO, env_id=CAR_FOLLOWING, **policy_kwargs):
-    return algorithm("MlpPolicy", gym.make(env_id), device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
+def make(algorithm=PPO, env=CAR_FOLLOWING, **policy_kwargs):
+    env = gym.make(env) if isinstance(env, str) else env
+    return algorithm("MlpPolicy", env, device="cpu", seed=0, policy_kwargs=policy_kwargs or None)
 
 
 def hooked():
@@ -61,12 +62,14 @@ def test_other_policies_are_simulated_by_torch(ego, reason):
 
 
 @pytest.mark.parametrize("net_arch", [[64, 64], []])
-def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arch):
-    model = make(A2C, CUT_IN, activation_fn=torch.nn.ReLU, net_arch=net_arch)
+@pytest.mark.parametrize("observation", ["features", "kinematics"])  # one value after the other, or vehicles in rows
+def test_actions_between_rectifiers_are_those_of_predict_to_the_last_bit(net_arch, observation):
+    env = gym.make(CUT_IN, observation=observation)
+    model = make(A2C, env, activation_fn=torch.nn.ReLU, net_arch=net_arch)
     found = find_inference(model)
     assert isinstance(found, DensePolicy)
     for size in (1, 25, 4096):
-        seen = np.random.default_rng(1).uniform(-5, 5, (size, 11)).astype(np.float32)
+        seen = np.random.default_rng(1).uniform(-5, 5, (size, *env.observation_space.shape)).astype(np.float32)
         np.testing.assert_array_equal(found.predict(seen)[0], model.predict(seen, deterministic=True)[0])
 
 
