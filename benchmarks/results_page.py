@@ -179,24 +179,29 @@ def format_bases() -> Iterator[str]:
 
 
 def format_egos(ids: frozenset[str]) -> Iterator[str]:
-    """Yield the section of the shipped egos.
+    """Yield the section of the egos.
 
     Args:
         ids: Environments that there are.
     """
     record = read("egos")
-    yield f"## Shipped egos\n\n`{record['command']}`: p of a collision within 10 s by two-stage.\n"
-    cells = [cell for cell in record["cells"] if cell["method"] == "two-stage" and cell["env_id"] in ids]
+    yield f"## Egos\n\n`{record['command']}`: p of a collision within 10 s by the default method, by plain draws"
+    yield "where an interval begins at 0; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the base"
+    yield "has strata, p in each of them too, or its upper end.\n"
+    cells = [cell for cell in record["cells"] if cell["env_id"] in ids]
     yield format_table(
-        ("scenario", "ego", "p", "95 % interval", "warnings", "likeliest crash"),
+        ("scenario", "ego", "p", "95 % interval", "strata", "warnings", "likeliest crash"),
         (
             (
                 name_of(cell["env_id"]),
                 f"`{cell['ego']}`" + (f", {cell['steps']:,} steps" if cell["steps"] else ""),
-                f"{cell['p']:.1e}",
-                f"{cell['low']:.1e} to {cell['high']:.1e}",
+                f"{cell['p']:.1e}" if cell["p"] else "0",
+                f"{cell['low']:.1e} to {cell['high']:.1e}" if cell["low"] else f"below {cell['high']:.1e}",
+                ", ".join(
+                    f"{name} {f'{p:.1e}' if p else f'below {high:.1e}'}" for name, (p, _, high) in cell["parts"].items()
+                ),
                 str(len(cell["warnings"])),
-                cell["words"] or "none found",
+                cell["words"],
             )
             for cell in cells
         ),
