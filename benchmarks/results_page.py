@@ -186,8 +186,8 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
     """
     record = read("egos")
     yield f"## Egos\n\n`{record['command']}`: p of a collision within 10 s by the default method, by plain draws"
-    yield "where an interval begins at 0; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the base"
-    yield "has strata, p in each of them too, or its upper end.\n"
+    yield "where an interval begins at 0; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the"
+    yield "base has strata, p in each of them too, or its upper end.\n"
     cells = [cell for cell in record["cells"] if cell["env_id"] in ids]
     yield format_table(
         ("scenario", "ego", "p", "95 % interval", "strata", "warnings", "likeliest crash"),
