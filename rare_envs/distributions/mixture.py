@@ -31,7 +31,7 @@ from rare_envs.distributions.space import (
     check_values,
     name_columns,
 )
-from rare_envs.distributions.truncated_normal import LOG_SQRT_2PI, Cut, TruncatedConditional, log_sum
+from rare_envs.distributions.truncated_normal import LOG_SQRT_2PI, TruncatedConditional, log_sum
 
 CHUNK = 16384
 """Rows times components worked on together: the temporaries of one chunk stay in the cache."""
@@ -145,18 +145,18 @@ class MappedMixture:
     ) -> TruncatedConditional:
         """Return the distribution of column j with the components of all parts, whose log weights (G, n) it changes."""
         sizes = [len(part.weights) for part in self.parts]
-        joined, ends = np.empty((8, sum(sizes), len(x))), np.cumsum(sizes)
+        joined, ends = np.empty((3, sum(sizes), len(x))), np.cumsum(sizes)
         for part, each, row, size, end in zip(self.parts, own, weights, sizes, ends, strict=True):
             row -= each.log_whole_mass()
             shift, slope = part.coordinates.line(j, x)
-            cut = each.cut if part.coordinates.rises(j) else each.cut.turned_round()
-            arrays = each.log_weights + row, shift + slope * each.mean, np.abs(slope) * each.scale, *cut
+            arrays = each.log_weights + row, shift + slope * each.mean, np.abs(slope) * each.scale
             for out, array in zip(joined, arrays, strict=True):
                 out[end - size : end] = array
         is_log = np.repeat([part.coordinates.is_log(j) for part in self.parts], sizes)[:, None]
-        log_weights, mean, scale, *cuts = joined
-        kinds = is_log if is_log.any() else None
-        return TruncatedConditional(log_weights, mean, scale, self.low[j], self.high[j], kinds, Cut(*cuts))
+        log_weights, mean, scale = joined
+        return TruncatedConditional(
+            log_weights, mean, scale, self.low[j], self.high[j], is_log if is_log.any() else None
+        )
 
 
 class Walk:
