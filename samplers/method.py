@@ -146,7 +146,9 @@ class Part:
     of_sum: float = math.nan
     """w_k p_k / p; NaN where p = 0."""
     method: str = ""
-    """Name of the method that gave p_k."""
+    """Names of the methods of its runs in their order: "mc, two-stage" for a search after a pilot of plain draws."""
+    resolved: bool = True
+    """Whether failures were met often enough to say how likely they are; if not, the upper end alone is to be used."""
     n_units: int = field(default=0, compare=False, repr=False)
     """Independent units of its points; in `Estimate.sample` they follow those of the parts before."""
 
@@ -172,12 +174,14 @@ class Part:
         if self.p == 0:
             what = f"no failure in {self.n_sim:,} simulations" if self.n_sim else "not simulated"
             return f"{about}p below {high:.1e}, {what}"
+        if not self.resolved:
+            return f"{about}p below {high:.1e}, not resolved ({self.p:.1e} found) by {self.n_sim:,} simulations"
         ends = f"[{low:.3e}, {high:.3e}]"
         return f"{about}p = {self.p:.3e} {ends}, {100 * self.of_sum:.3g} % of the sum; {self.n_sim:,} simulations"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
-        names = ("name", "share", "p", "interval", "cov", "of_sum", "n_sim", "method")
+        names = ("name", "share", "p", "interval", "cov", "of_sum", "n_sim", "method", "resolved")
         return {**{name: getattr(self, name) for name in names}, "status": str(self.outcome.status)}
 
 

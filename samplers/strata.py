@@ -12,9 +12,9 @@ With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in st
 t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum without a failure goes on, as far as
 max_sim allows, while it may add more than is known: w_k h_k > p, with h_k the upper end of its p_k.
 
-Where nothing fails in a stratum, or hardly anything (a c.o.v. of 1), simulations that are left are plain draws, which
-bring its upper end down: so are the `plain_draws` that a problem offers where there is no max_sim, as it does where
-they take seconds.
+Where nothing fails in a stratum, or too little to be believed (`samplers.replicate.is_resolved`), simulations that are
+left are plain draws, which bring its upper end down: so are the `plain_draws` that a problem offers where there is no
+max_sim, as it does where they take seconds.
 
 Where the method is `Auto`, pilots are plain draws, and a stratum in which some of them failed goes on with plain draws:
 where p_k is above some 0.005 a search gains little, and it may miss one of many regions.
@@ -27,7 +27,7 @@ References:
 """
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -39,11 +39,11 @@ from samplers.plain_draws import PlainDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     NOT_KNOWN,
-    UNINFORMATIVE_COV,
     InputsOnly,
     Replicate,
     combine,
     dilute,
+    is_resolved,
     needs_another,
     pool_counts,
     sum_strata,
@@ -65,7 +65,8 @@ MARGIN = 0.9
 MOST_ROUNDS = 6
 """Rounds of runs for a target, pilots aside."""
 PLENTY = 6000
-"""Simulations for a stratum in which nothing fails; further ones are plain draws, which all count in its upper end."""
+"""Simulations for the search of a stratum whose pilot resolved nothing; further ones are plain draws, which all count
+in its upper end."""
 LEAST_GAIN = 0.1
 """Plain draws are made where they are more than this part of the simulations made."""
 
@@ -144,16 +145,16 @@ class _Sum:
         if target is not None and whole.p > 0:
             for i, part in enumerate(whole.parts):
                 targets[i] = MARGIN * (limit := target / math.sqrt(part.of_sum or 1.0))
-                late = part.cov > limit and whole.cov > target
-                may_add_most = part.share * part.interval[1] > whole.p
-                use[i] = i not in self.at_limit and (late if part.p > 0 else may_add_most)
+                late = part.p > 0 and part.cov > limit and whole.cov > target
+                may_add_most = not part.resolved and part.share * part.interval[1] > whole.p
+                use[i] = i not in self.at_limit and (late or may_add_most)
         elif self.goal.max_sim is None:
             return []
         known = self.goal.max_sim is not None
-        sizes: list[int | None] = [int(n) for n in self._allocate(use)] if known else [None] * k
+        sizes: list[int | None] = [int(n) for n in self._allocate(use, whole.parts)] if known else [None] * k
         for i, size in enumerate(sizes):
-            if size is not None and self.parts[i].p == 0:
-                sizes[i] = min(size, PLENTY)
+            if size is not None and not whole.parts[i].resolved:
+                sizes[i] = min(size, PLENTY) if self.behind[i] < PLENTY else 0
         return [(i, sizes[i], targets[i], self._find_method(i)) for i in range(k) if use[i] and sizes[i] != 0]
 
     def _plan_searches(self) -> list[Task]:
@@ -181,7 +182,7 @@ class _Sum:
     def _is_unresolved(self, stratum: int) -> bool:
         """Return whether simulations of a stratum have met no failure, or too few to say how likely they are."""
         part = self.parts[stratum]
-        return part.n_sim > 0 and (part.p == 0 or part.cov >= UNINFORMATIVE_COV)
+        return part.n_sim > 0 and not is_resolved(part.outcome)
 
     def _plan_plain_draws(self) -> list[Task]:
         """Return plain draws for the strata that are not resolved, of the simulations left by their shares."""
@@ -191,13 +192,13 @@ class _Sum:
         drawn = [(i, int(n * self.parts[i].share / whole)) for i in empty]
         return [(i, size, None, PlainDraws()) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
 
-    def _allocate(self, use: NDArray[np.bool_]) -> FloatArray:
+    def _allocate(self, use: NDArray[np.bool_], parts: Sequence[Part]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
-        widths = [part.share * (part.interval[1] - part.interval[0]) for part in self.parts]
+        widths = [part.share * (part.interval[1] - part.interval[0]) for part in parts]
         need = np.sqrt(np.maximum(self.behind, 1.0)) * widths
-        pools = [part.outcome.counts is not None for part in self.parts]
+        pools = [part.outcome.counts is not None for part in parts]
         least = np.where(pools, 0.0, self.behind)  # a new run takes the place of the one before: a smaller one is worse
-        sizes = np.zeros(len(self.parts))
+        sizes = np.zeros(len(parts))
         while use.any():
             sizes = np.floor((self.goal.budget - self.n_sim) * need * use / (need * use).sum())
             gain = np.where(use, sizes - least, math.inf)
@@ -240,11 +241,12 @@ class _Sum:
             weights = tuple(replace(each, first=first + each.first) for each in run.outcome.draw_weights)
             outcomes.append(replace(run.outcome, trace=(), draw_weights=weights))
         found, n = combine(outcomes, goal.confidence), self.n_sim - n_before
-        if max_sim is None and target_cov is not None and found.cov > target_cov:
+        if max_sim is None and target_cov is not None and not (found.cov <= target_cov and is_resolved(found)):
             self.at_limit.add(stratum)
         whole, self.behind[stratum] = self._join(part, self.behind[stratum], found, n)
         whole = replace(whole, draw_weights=tuple(replace(each, run=0) for each in whole.draw_weights))
-        self.parts[stratum] = replace(part, outcome=whole, n_sim=part.n_sim + n, method=method.name)
+        methods = ", ".join(dict.fromkeys([*filter(None, part.method.split(", ")), method.name]))
+        self.parts[stratum] = replace(part, outcome=whole, n_sim=part.n_sim + n, method=methods)
 
     def _join(self, part: Part, n_old: float, found: Outcome, n: float) -> tuple[Outcome, float]:
         """Return the outcome of a stratum after a further run, and the simulations behind it."""
@@ -260,10 +262,9 @@ class _Sum:
             about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
             return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
-        if found.p == 0 < old.p and found.counts is not None and old.cov >= UNINFORMATIVE_COV:
-            low, high = old.interval  # of a search that hardly met any; as many plain draws say that it is rare
-            high = max(min(high, zero_hit_bound(found.base_draws, self.goal.confidence)), old.p)
-            return replace(old, interval=(low, high), base_draws=drawn), n_old
+        if found.p == 0 < old.p and found.counts is not None and not is_resolved(old):  # plain draws say that it is rare
+            high = max(zero_hit_bound(found.base_draws, self.goal.confidence), old.p)
+            return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
         if found.p == 0 == old.p:
             return replace(found, interval=(0.0, zero_hit_bound(drawn, self.goal.confidence)), base_draws=drawn), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost

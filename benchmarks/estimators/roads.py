@@ -50,9 +50,11 @@ class StratumRow(NamedTuple):
     high: float
     n_sim: int
     gain: float | None
-    """(1 - p) / p / (n_sim x c.o.v.^2): plain simulations for the same c.o.v. over those made; None where p = 0."""
+    """(1 - p) / p / (n_sim x c.o.v.^2): plain simulations for the same c.o.v. over those made; None if not resolved."""
+    resolved: bool
+    """Whether p is known; else the upper end alone is, as `samplers.Part` says."""
     by: str
-    """Method that gave p."""
+    """Methods of its runs."""
     doubts: int
     """Warnings and remarks that name the stratum."""
 
@@ -69,18 +71,18 @@ def draw_plain(problem: rare_envs.DrivingProblem, ego: str, draws: int, seed: in
         for first in range(0, draws, CHUNK):
             hits += int((problem.evaluate(stratum.base.sample(min(CHUNK, draws - first), rng)) <= 0.0).sum())
         ends = clopper_pearson(hits, draws, 0.95)
-        gain = 1.0 if hits else None
-        yield StratumRow(problem.env_id, ego, stratum.name, PLAIN, seed, hits / draws, *ends, draws, gain, "mc", 0)
+        known = (1.0, True) if hits else (None, False)
+        yield StratumRow(problem.env_id, ego, stratum.name, PLAIN, seed, hits / draws, *ends, draws, *known, "mc", 0)
 
 
 def run_method(problem: rare_envs.DrivingProblem, ego: str, method: str, seed: int, most: int) -> Iterator[StratumRow]:
     """Yield the strata of one run."""
     found = samplers.estimate(problem, method, seed=seed, max_sim=most, ensemble_run=False)
     for part in found.parts:
-        gain = None if part.p == 0 else (1.0 - part.p) / part.p / (part.n_sim * part.cov**2)
+        gain = (1.0 - part.p) / part.p / (part.n_sim * part.cov**2) if part.resolved else None
         doubts = sum(each.startswith(part.name) for each in (*found.warnings, *found.remarks))
         name = method if most == USUAL_BUDGET else f"{method}, max_sim {most}"
-        cells = part.p, *part.interval, part.n_sim, gain, part.method, doubts
+        cells = part.p, *part.interval, part.n_sim, gain, part.resolved, part.method, doubts
         yield StratumRow(problem.env_id, ego, part.name, name, seed, *cells)
 
 
@@ -133,7 +135,7 @@ def main(
                 for row in rows:
                     gain = "" if row.gain is None else f"{row.gain:.3g}"
                     ends = f"{row.p:.2e} {row.low:.2e} {row.high:.2e}"
-                    print(*row[:5], ends, row.n_sim, gain, row.by, row.doubts, flush=True)
+                    print(*row[:5], ends, row.n_sim, gain, *row[10:], flush=True)
                 write(rows, command)
 
 

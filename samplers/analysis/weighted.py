@@ -74,10 +74,11 @@ def no_outcome_weight(estimate: EstimateData, sample: Sample) -> float:
 def add_unresolved(
     estimate: EstimateData, thresholds: FloatArray, p: FloatArray, high: FloatArray, new_base: Any = None
 ) -> FloatArray:
-    """Return upper ends (G,) of p (G,) at thresholds g (G,) with what strata may add of which no point has f <= g.
+    """Return upper ends (G,) of p (G,) at thresholds g (G,) with what strata may add that are not resolved there.
 
-    That is the root of the sum of (w_k h_k)^2, h_k the upper end of their p_k, as in the interval of the sum. A new
-    base with strata of the same names has its own w_k.
+    These are all that are not at gamma, and those of which no point has f <= g. They may add the root of the sum of
+    (w_k h_k)^2, h_k the upper end of their p_k, as in the interval of the sum. A new base with strata of the same names
+    has its own w_k.
     """
     if not estimate.parts:
         return high
@@ -86,7 +87,8 @@ def add_unresolved(
     for part in estimate.parts:
         end = first + part.n_units
         least = min(each.f[(each.units >= first) & (each.units < end)].min(initial=math.inf) for each in layers)
-        squares += (least > thresholds) * (new_shares.get(part.name, part.share) * part.interval[1]) ** 2
+        unresolved = (least > thresholds) | (part.p > 0 and not part.resolved)
+        squares += unresolved * (new_shares.get(part.name, part.share) * part.interval[1]) ** 2
         first = end
     return np.asarray(np.where(squares > 0, np.minimum(p + np.hypot(high - p, np.sqrt(squares)), 1.0), high))
 

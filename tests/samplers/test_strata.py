@@ -16,7 +16,7 @@ from samplers.method import Outcome, Part
 from samplers.problem import StandardNormal, read_strata
 from samplers.proposals import Gaussian
 from samplers.replicate import sum_strata
-from samplers.sample import Status, bound_missed
+from samplers.sample import Sample, Status, bound_missed
 from samplers.testing import check_base
 
 
@@ -495,4 +495,34 @@ def test_where_a_search_would_gain_little_the_default_makes_plain_draws() -> Non
         result = samplers.estimate(problem, seed=seed, max_sim=8000)
         part = result.parts[0]
         assert part.method == "mc" and part.interval[0] < 0.012 < part.interval[1]
-        assert result.parts[1].method == "two-stage" and 0.5 < result.parts[1].p / norm.sf(5.0) < 2.0
+        assert result.parts[1].method == "mc, two-stage" and 0.5 < result.parts[1].p / norm.sf(5.0) < 2.0
+
+
+class Misled(samplers.Method):
+    """A search whose 100 base draws none fail, and whose 500 others find p = 1e-11 with a c.o.v. of 0.12."""
+
+    name, stops_at_target = "misled", True
+
+    def __init__(self, failing: int, lineages: float) -> None:
+        self.failing, self.lineages = failing, lineages
+
+    def steps(self, inputs, goal, rng):
+        yield inputs.base.sample(min(goal.budget, 600), rng)
+        k, n = self.failing, 500
+        weights, f = np.repeat([1e-11 / k, 0.0], [k, n - k]), np.repeat([-1.0, 1.0], [k, n - k])
+        points = Sample(f=f, weights=weights, units=np.arange(n), n_units=n, x=np.zeros((k, inputs.dim)), lineages=self.lineages)
+        known = {"p": 1e-11, "cov": 0.12, "interval": (8e-12, 1.5e-11), "status": Status.CONVERGED}
+        return Outcome(**known, sample=points, base_draws=100)
+
+
+@pytest.mark.parametrize(("failing", "lineages", "believed"), [(5, 4, False), (5, 20, True), (50, 4, True)])
+def test_a_poor_description_of_what_few_searches_found_gives_an_upper_end_alone(failing, lineages, believed) -> None:
+    problem = StratifiedProblem([Stratum("rare", 0.9, half_space(40.0)), Stratum("often", 0.1, half_space(1.0))])
+    rare = samplers.estimate(problem, Misled(failing, lineages), seed=0, max_sim=5000).parts[0]
+    assert rare.resolved == believed
+    if believed:
+        assert rare.interval[1] == pytest.approx(1.5e-11)
+    else:
+        draws = rare.outcome.base_draws - 200  # plain ones, after two searches
+        assert draws > 1000 and rare.interval[1] == pytest.approx(1 - 0.05 ** (1 / draws))
+        assert "not resolved (1.0e-11 found)" in str(rare)
