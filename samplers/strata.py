@@ -107,7 +107,9 @@ class _Sum:
         self.behind = np.zeros(len(self.strata))
         """Simulations of the runs behind the outcomes."""
         self.trace = list[Level]()
-        self.n_sim, self.stopped, self.searched, self.at_limit = 0, False, False, set[int]()
+        self.n_sim, self.stopped, self.at_limit = 0, False, set[int]()
+        self.searched = set[int]()
+        """Strata that had a run of the method chosen, or are not to have one."""
 
     def steps(self) -> Steps:
         """Make rounds of runs until there is nothing to add."""
@@ -152,23 +154,27 @@ class _Sum:
             return []
         known = self.goal.max_sim is not None
         sizes: list[int | None] = [int(n) for n in self._allocate(use, whole.parts)] if known else [None] * k
+        methods = [self._find_method(i) for i in range(k)]
         for i, size in enumerate(sizes):
-            if size is not None and not whole.parts[i].resolved:
+            if size is not None and methods[i] is None and not whole.parts[i].resolved:
                 sizes[i] = min(size, PLENTY) if self.behind[i] < PLENTY else 0
-        return [(i, sizes[i], targets[i], self._find_method(i)) for i in range(k) if use[i] and sizes[i] != 0]
+        return [(i, sizes[i], targets[i], methods[i]) for i in range(k) if use[i] and sizes[i] != 0]
 
     def _plan_searches(self) -> list[Task]:
-        """Return the runs after pilots of plain draws: half of what is left for the strata that hardly failed in them.
+        """Return the runs after pilots of plain draws, first those of the strata that hardly failed in them.
 
-        Without a max_sim they have the simulations that their method likes, and the others as many plain draws as cost
-        seconds.
+        They have half of what is left, to a target that of a pilot, or else the simulations that their method likes;
+        the others then as many plain draws as cost seconds.
         """
-        k, left = len(self.parts), self.goal.max_sim and self.goal.max_sim - self.n_sim
-        self.searched = True
+        k, left, target = len(self.parts), self.goal.max_sim and self.goal.max_sim - self.n_sim, self.goal.target_cov
         rare = [i for i in range(k) if (self.parts[i].outcome.counts or (0, 0))[0] < OFTEN]
-        if left is not None and rare and left >= 2 * FEWEST * len(rare):
-            return [(i, min(PLENTY, left // 2 // len(rare)), self.goal.target_cov, None) for i in rare]
-        if self.goal.target_cov is not None or left is not None:
+        if left is not None and left < 2 * FEWEST * len(rare):
+            self.searched |= {*rare}
+            rare = []
+        if rare and (left is not None or target is not None):
+            most = None if left is None else min(PLENTY, left // 2 // len(rare))
+            return [(i, most, target if left is not None else max(target or 0.0, PILOT_COV), None) for i in rare]
+        if left is not None or target is not None:
             return self._plan_more()
         plenty = self.plain_draws or PLENTY
         return [(i, None if i in rare else plenty, None, None if i in rare else PlainDraws()) for i in range(k)]
@@ -176,7 +182,7 @@ class _Sum:
     def _find_method(self, stratum: int) -> Stepping | None:
         """Return plain draws for a stratum in whose pilot some failed, or that was searched in vain; else None."""
         hits, _ = self.parts[stratum].outcome.counts or (0, 0)
-        in_vain = self.searched and self._is_unresolved(stratum)
+        in_vain = stratum in self.searched and self._is_unresolved(stratum)
         return PlainDraws() if self.chooses and (hits >= OFTEN or in_vain) else None
 
     def _is_unresolved(self, stratum: int) -> bool:
@@ -220,7 +226,9 @@ class _Sum:
             self.goal.on_level(replace(level, stratum=part.name, estimate=estimate))
 
         goal = replace(self.goal, max_sim=max_sim, target_cov=target_cov, on_level=tell_level)
-        method = method or choose_method(self.method, inputs, goal).method
+        if method is None:
+            self.searched.add(stratum)
+            method = choose_method(self.method, inputs, goal).method
         runs, outcomes = list[Replicate](), list[Outcome]()
         while not self.stopped and (not runs or needs_another(runs, method, goal, 1)):
             first = self.n_sim
@@ -262,8 +270,10 @@ class _Sum:
             about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
             return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
-        if found.p == 0 < old.p and found.counts is not None and not is_resolved(old):  # plain draws say that it is rare
-            high = max(zero_hit_bound(found.base_draws, self.goal.confidence), old.p)
+        if (
+            found.p == 0 < old.p and found.counts is not None and not is_resolved(old)
+        ):  # plain draws say that it is rare
+            high = max(zero_hit_bound(drawn, self.goal.confidence), old.p)
             return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
         if found.p == 0 == old.p:
             return replace(found, interval=(0.0, zero_hit_bound(drawn, self.goal.confidence)), base_draws=drawn), n

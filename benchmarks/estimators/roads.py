@@ -71,8 +71,8 @@ def draw_plain(problem: rare_envs.DrivingProblem, ego: str, draws: int, seed: in
         for first in range(0, draws, CHUNK):
             hits += int((problem.evaluate(stratum.base.sample(min(CHUNK, draws - first), rng)) <= 0.0).sum())
         ends = clopper_pearson(hits, draws, 0.95)
-        known = (1.0, True) if hits else (None, False)
-        yield StratumRow(problem.env_id, ego, stratum.name, PLAIN, seed, hits / draws, *ends, draws, *known, "mc", 0)
+        gain, cells = 1.0 if hits else None, (seed, hits / draws, *ends, draws)
+        yield StratumRow(problem.env_id, ego, stratum.name, PLAIN, *cells, gain, hits > 0, "mc", 0)
 
 
 def run_method(problem: rare_envs.DrivingProblem, ego: str, method: str, seed: int, most: int) -> Iterator[StratumRow]:

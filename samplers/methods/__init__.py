@@ -48,7 +48,7 @@ class Auto(Method):
 
     The budget is that of one replicate. The result is that of the method chosen, to the bit, and names it;
     `Estimate.choice` says which and why, and so does the result's text where it is not `TwoStage`. In a sum over strata
-    every run of a stratum chooses for itself, by its own budget (`Part.method` is the last choice).
+    every run of a stratum chooses for itself, by its own budget, after a pilot of plain draws; `Part.method` names all.
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.
