@@ -171,7 +171,7 @@ class AcceptedGaps:
         inner, z = np.array(self.mixture.read_rows("u", u)), np.zeros(np.shape(u))
         speed, gap = -inner[:, self._speed], inner[:, self._gap].copy()
         z[:, self._speed] = self._closing.from_normal(speed)
-        walk = Walk([self.mixture], z)
+        walk = Walk(self.mixture, z)
         inner[:, self._speed] = walk.start_column(self._speed).to_normal(z[:, self._speed])
         parts = list(self._closing_rows(z[:, self._speed]))
         for rows in parts:
@@ -252,7 +252,7 @@ class AcceptedGaps:
 
     def _given(self, z: FloatArray) -> _Gaps:
         """Return the distribution of the log gap in rows z whose closing speed is set."""
-        walk = Walk([self.mixture], z)
+        walk = Walk(self.mixture, z)
         walk.start_column(self._speed)
         walk.observe(self._speed)
         walk.take_density()
@@ -265,14 +265,14 @@ class AcceptedGaps:
         edges = np.append(np.arange(0.0, top, CLOSING_STEP), top)
         z = np.zeros((GAP_PANELS // 2 * (len(edges) - 1), self.dim))
         z[:, self._speed] = _nodes_of(edges[:-1], edges[1:]).ravel()
-        walk = Walk([self.mixture], z)
+        walk = Walk(self.mixture, z)
         column = walk.start_column(self._speed)
         mass = column.log_whole_mass()
         walk.observe(self._speed)
         density = np.exp(walk.take_density() - mass)
         parts = [self._given(z[rows]).total for rows in self._closing_rows(z[:, self._speed])]
         zero = np.zeros((1, self.dim))
-        below = Walk([self.mixture], zero).start_column(self._speed).to_normal(zero[:, self._speed])
+        below = Walk(self.mixture, zero).start_column(self._speed).to_normal(zero[:, self._speed])
         values = (density * np.concatenate(parts)).reshape(len(edges) - 1, -1)
         return _Closing.of(self, edges, values, float(below[0]))
 
@@ -418,7 +418,7 @@ class _Closing(NamedTuple):
         from_zero = np.log(np.maximum(below - above, TINY))
         log_mass = np.minimum(np.where(near_zero, from_zero, log_lower), self.log_below)
         own = self.owner
-        column = Walk([own.mixture], np.zeros((len(v), own.dim))).start_column(own._speed)
+        column = Walk(own.mixture, np.zeros((len(v), own.dim))).start_column(own._speed)
         closing = np.array(column.from_normal(ndtri_exp(log_mass)))
         closing[positive] = self._solve(np.exp(log_upper[positive]))
         closing[~positive] = np.minimum(closing[~positive], 0.0)

@@ -16,7 +16,6 @@ from rare_envs.distributions.events import EventCounts, EventFrequency, Predicti
 from rare_envs.distributions.mixture import (
     COMPONENT_FIELDS,
     TruncatedGaussianMixture,
-    find_log_densities,
     name_kinds,
     pool_mixtures,
 )
@@ -156,19 +155,6 @@ class FittedDistribution:
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Map from standard normal space, (n, d) -> (n, d)."""
         return self.distribution.from_standard_normal(u)
-
-    def refit_log_probs(self, x: FloatArray) -> FloatArray:
-        """Return the log density of each of R refits, (n, d) -> (R, n); of like mixtures at once."""
-        out, groups = np.empty((len(self.refits), len(x))), dict[object, list[int]]()
-        for i, each in enumerate(self.refits):
-            if type(each) is TruncatedGaussianMixture:  # one of the user's below it may have another density
-                key = name_kinds(each), each.coordinates.columns, len(each.weights)
-                groups.setdefault(key, []).append(i)
-            else:
-                out[i] = each.log_prob(x)
-        for rows in groups.values():
-            out[rows] = find_log_densities([cast(TruncatedGaussianMixture, self.refits[i]) for i in rows], x)
-        return out
 
     def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
         """Return the parameters of `distribution`, none if it offers none; see `DistributionParameter`."""

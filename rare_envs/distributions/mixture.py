@@ -129,7 +129,7 @@ class MappedMixture:
 
     def _conditionals(self, x: FloatArray) -> Iterator[tuple[int, TruncatedConditional]]:
         """Yield columns and their distributions given the earlier ones of x (n, d), which may be set on the way."""
-        walks, columns = [Walk([part], x) for part in self.parts], self.coordinates.columns
+        walks, columns = [Walk(part, x) for part in self.parts], self.coordinates.columns
         weights = np.log(self.shares)[:, None] + np.zeros(len(x))
         for j in columns:
             own = [walk.start_column(j) for walk in walks]
@@ -160,18 +160,12 @@ class MappedMixture:
 
 
 class Walk:
-    """Mixtures of as many components on their way through points x (n, d), each column conditioned on the earlier ones.
+    """A mixture on its way through points x (n, d), each column conditioned on the earlier ones; arrays are (K, n)."""
 
-    Arrays are (K, n), or (K, R, n) of several mixtures, which have the same coordinates.
-    """
-
-    def __init__(self, mixtures: Sequence[TruncatedGaussianMixture], x: FloatArray) -> None:
-        self._coordinates, self._x = mixtures[0].coordinates, x
-        weights, self._means, self._factors = (
-            (np.stack(arrays, axis=-1) if len(mixtures) > 1 else arrays[0])[..., None]
-            for arrays in zip(*((each.weights, each.means, each.factors) for each in mixtures), strict=True)
-        )
-        self._log_weights: FloatArray = np.log(weights)
+    def __init__(self, mixture: TruncatedGaussianMixture, x: FloatArray) -> None:
+        self._coordinates, self._x = mixture.coordinates, x
+        self._means, self._factors = mixture.means[..., None], mixture.factors[..., None]
+        self._log_weights: FloatArray = np.log(mixture.weights)[:, None]
         self._residuals: list[FloatArray] = []
         self._column: TruncatedConditional
 
@@ -194,7 +188,7 @@ class Walk:
         self._residuals.append(residual)
 
     def take_density(self) -> FloatArray:
-        """Return the log density, not cut, of the coordinate observed last given the earlier ones, (n,) or (R, n)."""
+        """Return the log density, not cut, of the coordinate observed last given the earlier ones, (n,)."""
         density = log_sum(self._log_weights)
         self._log_weights = self._log_weights - density  # relative to it, so that far points do not run away
         return density
@@ -283,7 +277,11 @@ class TruncatedGaussianMixture(MappedMixture):
         Raises:
             ValueError: Wrong shape.
         """
-        return np.asarray(find_log_densities([self], x)[0])
+        points = self.read_rows("x", x)
+        inside = self.coordinates.contains(points).all(axis=1)
+        out = np.full(len(points), -np.inf)
+        out[inside] = self._by_chunks(self._log_density, self.coordinates.interior(points[inside]))
+        return out
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw points, shape (n, d), by ancestral sampling: per coordinate a component, then its truncated normal.
@@ -342,6 +340,15 @@ class TruncatedGaussianMixture(MappedMixture):
         """
         weights, means, covariances, _, _ = pick_fields(data, (*COMPONENT_FIELDS, "low", "high"))
         return cls(weights, means, covariances, coordinates=Coordinates.from_dict(data))
+
+    def _log_density(self, x: FloatArray) -> FloatArray:
+        """Return the log density at points inside the box, (n,)."""
+        walk, density = Walk(self, x), self.coordinates.log_jacobian(x)
+        for j in self.coordinates.columns:
+            mass = walk.start_column(j).log_whole_mass()
+            walk.observe(j)
+            density = density - mass + walk.take_density()
+        return density
 
     def _draw(self, uniforms: FloatArray) -> FloatArray:
         """Return draws (n, d) from uniforms (n, 2 d)."""
@@ -405,24 +412,6 @@ class PooledMixture(MappedMixture):
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, d); the first rows do not depend on n."""
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
-
-
-def find_log_densities(mixtures: Sequence[TruncatedGaussianMixture], x: ArrayLike) -> FloatArray:
-    """Return the log densities of R mixtures in the same coordinates, each of K components, (n, d) -> (R, n)."""
-    own = mixtures[0]
-    points = own.read_rows("x", x)
-    inside = np.flatnonzero(own.coordinates.contains(points).all(axis=1))
-    out = np.full((len(mixtures), len(points)), -np.inf)
-    size = max(1, CHUNK // (len(mixtures) * len(own.weights)))
-    for rows in (inside[start : start + size] for start in range(0, len(inside), size)):
-        inner = own.coordinates.interior(points[rows])
-        walk, density = Walk(mixtures, inner), own.coordinates.log_jacobian(inner)
-        for j in own.coordinates.columns:
-            mass = walk.start_column(j).log_whole_mass()
-            walk.observe(j)
-            density = density - mass + walk.take_density()
-        out[:, rows] = density
-    return out
 
 
 def pool_mixtures(mixtures: Sequence[Distribution]) -> TruncatedGaussianMixture | PooledMixture:

@@ -15,6 +15,7 @@ from rare_envs.distributions.coordinates import FloatArray, freeze_arrays
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution, box_of
 from rare_envs.distributions.space import RELATIVE_CHANGE, Distribution, DistributionParameter, check_values
+from rare_envs.distributions.truncated_normal import cut_quantile, log_interval
 
 SHARE_ROUNDING = 1e-9
 """Shares add up to 1 within this."""
@@ -60,35 +61,27 @@ class CutNormals:
         points = np.asarray(x, dtype=np.float64)
         inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
         density = -0.5 * ((points * points).sum(axis=1) + self.dim * np.log(2.0 * np.pi))
-        return np.where(inside, density - self._log_mass.sum(), -np.inf)
+        cut = self._cut
+        return np.where(inside, density - log_interval(self.low[cut], self.high[cut]).sum(), -np.inf)
 
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
         """Map to standard normal space, (n, d) -> (n, d), from the nearer tail."""
-        points = np.clip(np.asarray(x, dtype=np.float64), self.low, self.high)
-        u = points.copy()
-        for j in np.flatnonzero(self._is_cut):
-            below = _log_between(self.low[j], points[:, j]) - self._log_mass[j]
-            above = _log_between(points[:, j], self.high[j]) - self._log_mass[j]
-            u[:, j] = normal_of_tails(below, above)
+        u, cut = np.clip(np.asarray(x, dtype=np.float64), self.low, self.high), self._cut
+        low, z, high = self.low[cut], u[:, cut], self.high[cut]
+        u[:, cut] = normal_of_tails(log_interval(low, z), log_interval(z, high))
         return u
 
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
         """Map from standard normal space, (n, d) -> (n, d)."""
-        x = np.array(u, dtype=np.float64)
-        for j in np.flatnonzero(self._is_cut):
-            below = np.logaddexp(log_ndtr(self.low[j]), log_ndtr(x[:, j]) + self._log_mass[j])
-            above = np.logaddexp(log_ndtr(-self.high[j]), log_ndtr(-x[:, j]) + self._log_mass[j])
-            x[:, j] = np.clip(normal_of_tails(below, above), self.low[j], self.high[j])
+        x, cut = np.array(u, dtype=np.float64), self._cut
+        below, above = log_ndtr(x[:, cut]), log_ndtr(-x[:, cut])
+        x[:, cut] = cut_quantile(self.low[cut], self.high[cut], below, above)
         return x
 
     @property
-    def _is_cut(self) -> NDArray[np.bool_]:
-        return np.isfinite(self.low) | np.isfinite(self.high)
-
-    @property
-    def _log_mass(self) -> FloatArray:
-        """Log of the mass of each in its range, (d,)."""
-        return np.array([_log_between(low, high) for low, high in zip(self.low, self.high, strict=True)])
+    def _cut(self) -> NDArray[np.intp]:
+        """Columns with an end."""
+        return np.flatnonzero(np.isfinite(self.low) | np.isfinite(self.high))
 
 
 class Stratum(NamedTuple):
@@ -335,13 +328,6 @@ def write_part(base: Any) -> dict[str, Any]:
     ends = [(a, b) for each in normals for a, b in zip(each.low.tolist(), each.high.tolist(), strict=True)]
     finite = [[None if np.isinf(end) else end for end in pair] for pair in ends]
     return {**part.to_dict(), **({"normals": finite} if finite else {})}
-
-
-def _log_between(a: Any, b: Any) -> Any:
-    """Return log(Phi(b) - Phi(a)) for a <= b, accurate in both tails."""
-    flip = np.asarray(a) > -np.asarray(b)
-    lower, upper = np.where(flip, -b, a), np.where(flip, -a, b)
-    return _log_less(log_ndtr(upper), log_ndtr(lower))
 
 
 def _log_less(log_a: Any, log_b: Any) -> Any:

@@ -37,7 +37,6 @@ class TruncatedConditional:
 
     log_weights, which need not be normalised, and mean have shape (K, n), or (K, 1) if they are the same in all rows,
     and scale (K, 1) or (K, n); low and high are scalars or (n,). Components with is_log (K, 1) are normal in log x.
-    Masses are also those of R mixtures at once, (K, R, n) in place of (K, n).
     """
 
     log_weights: FloatArray

@@ -64,8 +64,8 @@ class FittedBase(Distribution, Protocol):
 
     With `ensemble()`, the mixture of the refits with equal weights (a ValueError where they cannot be mixed), it lets
     `estimate` make a further run where the points of the first do not reach the refits; `covering_ensemble()` is the
-    mixture of a few of many refits that reach as far. `refit_log_probs(x)` may give the log densities of all R refits
-    at x (k, d) at once, shape (R, k); `refit_families` the number of the family of each, 0 for that of the base.
+    mixture of a few of many refits that reach as far; `refit_families` the number of the family of each, 0 for that of
+    the base.
 
     Example:
         >>> import samplers
@@ -304,11 +304,7 @@ def refit_log_ratios(estimate: EstimateData, sample: Sample, refits: Sequence[An
         if all(a is b for a, b in zip(kept, of, strict=True)):
             return ratios
     old = log_density(base, x)
-    together: Any = base
-    if hasattr(base, "refit_log_probs") and refits is together.refits:
-        new = np.asarray(together.refit_log_probs(x))
-    else:
-        new = np.array([log_density(refit, x) for refit in refits], dtype=np.float64).reshape(len(refits), len(x))
+    new = np.array([log_density(refit, x) for refit in refits], dtype=np.float64).reshape(len(refits), len(x))
     estimate.refit_ratios[:] = [(of, _subtract_log_densities(new, old, x))]
     return estimate.refit_ratios[0][1]
 

@@ -93,17 +93,6 @@ def test_refits_are_distributions_of_the_same_coordinates_with_components_of_the
     assert (BASE.refits[2].log_prob(x) == alone.log_prob(x)).all()
 
 
-def test_densities_of_all_refits_at_once_are_each_refit_s_own_and_zero_outside_the_box() -> None:
-    x = BASE.sample(50, np.random.default_rng(0))
-    x[:3] = np.array([[-1.0, 20.0, 30.0], [20.0, 46.0, 30.0], [20.0, 20.0, 0.5]])
-    found = BASE.refit_log_probs(x)
-    np.testing.assert_allclose(found, [refit.log_prob(x) for refit in BASE.refits], rtol=1e-12)
-    assert np.isneginf(found[:, :3]).all() and np.isfinite(found[:, 3:]).all()
-    beta = BetaDistribution([2.0] * 3, [2.0] * 3, BASE.low, BASE.high)
-    mixed = replace(BASE, refits=(beta, *BASE.refits)).refit_log_probs(x)
-    np.testing.assert_array_equal(mixed, np.stack([beta.log_prob(x), *found]))
-
-
 def test_the_ensemble_is_the_mean_of_the_refits() -> None:
     """Up to the mass outside the box, which is below 1e-3 for the typical points compared here."""
     ensemble = BASE.ensemble()
