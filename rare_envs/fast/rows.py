@@ -39,13 +39,15 @@ class CutterNumbers(NamedTuple):
     """Distance of centres along the road within which the ego is beside it [m]."""
     line: float
     """y at which its body is over the line [m]."""
+    reach_across: float
+    """Distance of centres across within which it follows the ego ahead of it [m]."""
 
     @classmethod
     def of(cls, model: CutterModel, dt: float) -> "CutterNumbers":
         """Return the numbers of a model and a tick [s]."""
         reach, coolness = VEHICLE_LENGTH + model.margin, -1.0 if model.coolness is None else model.coolness
         own = (model.idm.comfortable_deceleration, coolness, model.ticks_to_turn(dt), model.most_braking)
-        return cls(*single(*own, reach, OVER_THE_LINE))
+        return cls(*single(*own, reach, OVER_THE_LINE, model.reach_across))
 
 
 class ScriptNumbers(NamedTuple):
@@ -175,7 +177,7 @@ _INFINITE = np.float32(np.inf)
 @inlined
 def human_cut_in(rows: Rows, idm: IDMNumbers, model: CutterNumbers, dt: float) -> None:
     """Move cutter and lead: `rare_envs.scenarios.cut_in.CutterModel.others`; theta has the columns of `CutInTheta`."""
-    ego_x, ego_speed = rows.x[0], rows.speed[0]
+    ego_x, ego_y, ego_speed = rows.x[0], rows.y[0], rows.speed[0]
     x, y, heading, speed, cos = rows.x[1], rows.y[1], rows.heading[1], rows.speed[1], rows.cosine[1]
     lead_x, lead_speed, slope = rows.x[2], rows.speed[2], rows.spare[0]
     lead_y, lead_heading, lead_cos = rows.y[2], rows.heading[2], rows.cosine[2]
@@ -184,7 +186,10 @@ def human_cut_in(rows: Rows, idm: IDMNumbers, model: CutterNumbers, dt: float) -
     time, way, waited, over, turned = rows.theta[9], rows.theta[10], rows.theta[11], rows.theta[12], rows.theta[13]
     bends = False
     for row in range(rows.size):
-        gap, closing = lead_x[row] - x[row] - eq.BODY_LENGTH, speed[row] - lead_speed[row] * cos[row]
+        gap, gap_to_ego = lead_x[row] - x[row] - eq.BODY_LENGTH, ego_x[row] - x[row] - eq.BODY_LENGTH
+        behind = (gap_to_ego >= eq.ZERO) & (gap_to_ego < gap) & (abs(ego_y[row] - y[row]) < model.reach_across)
+        gap = gap_to_ego if behind else gap
+        closing = speed[row] - (ego_speed[row] if behind else lead_speed[row]) * cos[row]
         ratio = speed[row] / desired_speed[row]
         if model.coolness < eq.ZERO:
             free = eq.fourth_power(ratio) if idm.exponent == eq.FOUR else ratio**idm.exponent

@@ -192,11 +192,12 @@ class CutInTheta(NamedTuple):
 class CutterModel:
     """A cutter that drives as people do, and its lead: what `CutIn-v1` is made of.
 
-    Along: behind its new lead by the improved IDM with the constant-acceleration heuristic, for a lead that keeps its
-    speed, and no faster than at its start. Across: forward on the Bezier with progress speed cos(heading) dt / length,
-    or back, a reaction time after the place was taken: while the ego is beside it, or is behind it and would have to
-    brake by more than `most_braking`. It looks until it is in the lane. A cutter that has not looked checks nothing
-    until it notices the ego, and then turns back at once. The lead keeps its speed, or brakes once in a parabola.
+    Along: behind its new lead, or the ego where it drops in behind it, by the improved IDM with the
+    constant-acceleration heuristic, for a lead that keeps its speed, and no faster than at its start. Across: forward
+    on the Bezier with progress speed cos(heading) dt / length, or back, a reaction time after the place was taken:
+    while the ego is beside it, or is behind it and would have to brake by more than `most_braking`. It looks until it
+    is in the lane. A cutter that has not looked checks nothing until it notices the ego, and then turns back at once.
+    The lead keeps its speed, or brakes once in a parabola.
 
     Measured against recorded cutters from the same states (root mean square error of the mean acceleration over 2 s):
     0.69 m/s^2 on US 101 and 0.53 on I-80, where `CutIn-v0`'s script has 1.31 and 0.94.
@@ -213,7 +214,7 @@ class CutterModel:
     """
 
     looks: bool = True
-    """Whether the cutter ever looks; without it nobody turns back, as in `CutIn-v0`."""
+    """Whether the cutter ever looks; without it nobody turns back or follows the ego, as in `CutIn-v0`."""
     idm: IDM = ATTENTIVE_IDM
     """a, b, T, s0 and hardest braking behind the lead: those of the human driver (Treiber and Kesting 2013, table 11.2;
     0.774 g of UN Regulation 157). v0 is the initial speed, at least 1 m/s (assumed)."""
@@ -271,7 +272,7 @@ class CutterModel:
         rank = torch.special.ndtr(braking) / chance
         peak = torch.exp(self.peak[0] + self.peak[1] * peak)
         loss = torch.minimum(torch.exp(self.loss[0] + self.loss[1] * loss), lead_speed)
-        zero, brakes = torch.zeros_like(offset), rank < 1.0
+        zero, brakes = torch.zeros_like(offset), (rank < 1.0) & (loss > 0.0)
         state = _start(x)
         theta = CutInTheta(
             length=(cut_in_speed * duration).clamp(min=CUT_IN_MIN_LENGTH),
@@ -294,9 +295,7 @@ class CutterModel:
     def others(self, state: State, dt: float) -> Others:
         """Move the lead, which keeps its speed or brakes once, and the cutter behind and in front of it."""
         theta = CutInTheta(*state.theta.unbind(dim=1))
-        (x, _, heading, speed), (lead_x, _, _, lead_speed) = state.vehicles[1:]
-        tick, body = scalars((dt, VEHICLE_LENGTH), x)
-        lead = Lead(lead_x - x - body, speed - lead_speed * torch.cos(heading))
+        (tick,), speed, lead = scalars((dt,), state.x), state.vehicles[1].speed, self._find_lead(state)
         if self.coolness is None:
             acceleration = self.idm.acceleration(speed, lead, theta.desired_speed)
         else:
@@ -309,6 +308,20 @@ class CutterModel:
         """Move both with the accelerations of their drivers; across the cutter goes on and turns back by itself."""
         speed = (state.speed[:, 1:] + action[..., 0] * dt).clamp(min=0.0)
         return self._advance(state, CutInTheta(*state.theta.unbind(dim=1)), speed[:, 0], speed[:, 1], dt)
+
+    def _find_lead(self, state: State) -> Lead:
+        """Return who the cutter follows: its new lead, or the ego where it drops in behind it."""
+        ego, cutter, lead = state.vehicles
+        (body,) = scalars((VEHICLE_LENGTH,), cutter.x)
+        gap, gap_to_ego = lead.x - cutter.x - body, ego.x - cutter.x - body
+        behind = (gap_to_ego >= 0.0) & (gap_to_ego < gap) & ((ego.y - cutter.y).abs() < self.reach_across)
+        speed = torch.where(behind, ego.speed, lead.speed) * torch.cos(cutter.heading)
+        return Lead(torch.where(behind, gap_to_ego, gap), cutter.speed - speed)
+
+    @property
+    def reach_across(self) -> float:
+        """Distance of centres across within which the ego ahead is followed [m]: a body in the other's lane."""
+        return OVER_THE_LINE if self.looks else 0.0
 
     def ticks_to_turn(self, dt: float) -> float:
         """Return the reaction time in ticks of dt [s]."""

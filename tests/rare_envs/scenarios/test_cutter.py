@@ -87,6 +87,25 @@ def test_it_turns_back_in_front_of_an_ego_that_would_have_to_brake_hard() -> Non
     assert across(point(ego_speed=25.0, cut_in_gap=10.0), CutterModel(most_braking=1e9).scenario())[15] < y[14]
 
 
+class Slowing(Coasting):
+    """An ego that brakes by 2 m/s^2."""
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        return torch.tensor([-2.0, 0.0], dtype=F64).expand(len(episode.collided), 2), memory
+
+
+@pytest.mark.parametrize("attention", [0.0, ATTENTION_LIMIT - 1.0])
+@pytest.mark.parametrize("looks", [True, False])
+def test_whoever_drops_in_behind_the_ego_follows_it(looks: bool, attention: float) -> None:
+    """The ego passes: 10 m/s faster at first and 10 m/s slower after 10 s, when it would be where the cutter is."""
+    x = point(ego_speed=30.0, cut_in_gap=-7.0, duration=8.0, attention=attention)
+    end = rollout(World(CutterModel(looks=looks).scenario()), Slowing(), x)
+    ego, cutter, _ = end.state.vehicles
+    assert cutter.y.item() == 0.0 and bool(end.collided) is not looks
+    if looks:
+        assert 2.0 < (ego.x - cutter.x - 5.0).item() and cutter.speed.item() < 15.0
+
+
 @pytest.mark.parametrize(("delay", "ticks"), [(0.1, 1), (0.25, 3), (0.5, 5)])
 def test_whoever_has_not_looked_notices_late_and_then_turns_at_once(delay: float, ticks: int) -> None:
     """The body is over the line where y < 3 m: 3 s^2 - 2 s^3 > 1/7 from s = 0.236 on, at tick 10 of 40."""
@@ -143,6 +162,16 @@ def test_the_later_it_is_noticed_the_more_often_they_touch() -> None:
     assert touched == sorted(touched) and touched[-1] > 1.2 * touched[0] > 0
 
 
+def test_who_has_not_looked_is_told_by_attention_alone() -> None:
+    """Beside the ego, those below the limit of attention who never notice it touch it, and nobody else does."""
+    below = float(np.nextafter(ATTENTION_LIMIT, -9.0))
+    touched = [
+        rollout(World(CUT_IN_V1), Coasting(), point(cut_in_gap=-3.0, noticing=-3.0, attention=each)).collided.item()
+        for each in (-9.0, below, ATTENTION_LIMIT, 9.0)
+    ]
+    assert touched == [True, True, False, False]
+
+
 def test_a_lead_brakes_once_in_a_parabola() -> None:
     """At 20 m/s brakings have a chance of 0.246 in 10 s; a rank of a fifth of it is an onset of 2 s.
 
@@ -164,6 +193,8 @@ def test_a_lead_brakes_once_in_a_parabola() -> None:
     assert all(each.speed[0, 2] == 20.0 for each in never)
     slow = states(point(lead_speed=2.0, cut_in_speed=2.0, ego_speed=2.0, lead_braking=-9.0))
     assert slow[-1].speed[0, 2] == 0.0  # no more than its speed is lost
+    stands = states(point(lead_speed=0.0, lead_braking=-40.0, lead_peak=-400.0))
+    assert stands[-1].speed[0, 2] == 0.0 and bool(stands[-1].x.isfinite().all())
 
 
 def test_the_indicator_is_on_until_the_change_is_over() -> None:
