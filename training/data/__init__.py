@@ -10,7 +10,7 @@ from training.data.formats import (
     load_tgsim,
 )
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
-from training.data.table import NOBODY, Trajectories, read_trajectories, synthetic_traffic, tabulate, write_trajectories
+from training.data.table import NOBODY, Trajectories, synthetic_traffic, tabulate
 
 __all__ = [
     "NOBODY",
@@ -26,10 +26,8 @@ __all__ = [
     "load_recordings",
     "load_tgsim",
     "load_us101_scenes",
-    "read_trajectories",
     "scenes_of",
     "split_by_clock",
     "synthetic_traffic",
     "tabulate",
-    "write_trajectories",
 ]

@@ -239,9 +239,7 @@ def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tup
     return number, np.where(known, number[order][place], NOBODY)
 
 
-def load_coifman_li(
-    path: Path | str, *, ngsim: Path | str | None = None, length: float = MEAN_LENGTH, gaps: Gaps = "error"
-) -> Trajectories:
+def load_coifman_li(path: Path | str, *, length: float = MEAN_LENGTH, gaps: Gaps = "error") -> Trajectories:
     r"""Return the recording of Coifman and Li; it is named after the file.
 
     A gap is the distance of the rear bumpers less the length of the follower, so an assumed length shifts it. There
@@ -250,8 +248,7 @@ def load_coifman_li(
 
     Args:
         path: The MATLAB file, or a text file of its 18 columns without a header, separated by blanks or commas.
-        ngsim: Raw NGSIM file of the same period, for the lengths of the vehicles that are in both.
-        length: Length assumed of all others [m].
+        length: Length assumed of all vehicles [m].
         gaps: As of `load_ngsim`.
 
     Raises:
@@ -275,13 +272,12 @@ def load_coifman_li(
             "file of NGSIM's own, whose positions are those of the front?"
         )
     check_tracks(rows, rows["vehicle"], rows["frame"], rows["x"], rows["speed"], DT, gaps)
-    lengths = np.full(len(rows), length) if ngsim is None else _known_lengths(rows["vehicle"], Path(ngsim), length)
     columns = {
         **_take(rows, "vehicle frame speed acceleration lane"),
         "recording": path.stem,
-        "x": rows["x"] + 0.5 * lengths,
+        "x": rows["x"] + 0.5 * length,
         "y": np.nan,
-        "length": lengths,
+        "length": length,
         "width": np.nan,
         "leader": np.where(rows["leader"] > 0, rows["leader"], NOBODY),
     }
@@ -297,19 +293,6 @@ def _read_mat(path: Path) -> FloatArray:
     if data.ndim != 2 or data.dtype.kind not in "fiu":
         raise ValueError(f"{path} has no matrix of numbers 'data'; is it the file of Coifman and Li?")
     return data.astype(np.float64)
-
-
-def _known_lengths(vehicle: FloatArray, ngsim: Path, length: float) -> FloatArray:
-    """Return lengths by the numbers of vehicles [m], shape (rows,): NGSIM's lower median, or the assumed one."""
-    other = load_ngsim(ngsim, gaps="cut")
-    parts = np.split(other.length, 1 + np.flatnonzero(np.diff(other.vehicle)))
-    lengths = {
-        number: float(np.sort(part)[(len(part) - 1) // 2])
-        for number, part in zip(np.unique(other.vehicle).tolist(), parts, strict=True)
-    }
-    if not lengths.keys() & {*vehicle.tolist()}:
-        raise ValueError(f"{ngsim} has none of the vehicles; is it the recording of I-80 from 16:00 to 16:15?")
-    return np.array([lengths.get(number, length) for number in vehicle.tolist()])
 
 
 def highd_recordings(folder: Path | str) -> tuple[str, ...]:

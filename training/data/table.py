@@ -8,7 +8,6 @@ from next generation simulation trajectory data", 2008), here by penalised least
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
@@ -34,7 +33,6 @@ SCENES_FILE = "ngsim_us101_scenes.parquet"
 VEHICLES_FILE = "ngsim_us101_vehicles.parquet"
 US101_EDGES = (0.0, 3.49, 6.87, 10.20, 13.52, 17.25, 21.0)
 """Lane boundaries of US 101 [m], measured from the left edge of the road; lane 6 is the weaving lane."""
-_METADATA = b"rare_envs.edges"
 _TYPES: dict[str, Any] = {"recording": np.str_} | dict.fromkeys(("vehicle", "frame", "lane", "leader"), np.int64)
 
 
@@ -178,42 +176,6 @@ def find_leaders(
     return leader
 
 
-def write_trajectories(trajectories: Trajectories, path: Path | str) -> None:
-    """Write a table to a parquet file, with the lane boundaries in its metadata.
-
-    Example:
-        >>> import tempfile
-        >>> from training.data import synthetic_traffic
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_trajectories(synthetic_traffic(seconds=2.0), f"{folder}/table.parquet")
-        ...     len(read_trajectories(f"{folder}/table.parquet"))
-        180
-    """
-    edges = json.dumps({name: list(values) for name, values in trajectories.edges.items()})
-    table = pa.table({name: pa.array(getattr(trajectories, name)) for name in COLUMNS})
-    pq.write_table(table.replace_schema_metadata({_METADATA: edges.encode()}), path)
-
-
-def read_trajectories(path: Path | str) -> Trajectories:
-    """Return a table from a file of `write_trajectories`.
-
-    Raises:
-        ValueError: The file cannot be read, lacks a column or holds impossible values.
-
-    Example:
-        >>> read_trajectories("no_such_table.parquet")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ValueError: Cannot read no_such_table.parquet: ...
-    """
-    table = _read_parquet(path, COLUMNS)
-    edges = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
-    try:
-        columns = {name: table[name].to_numpy() for name in COLUMNS}
-        return tabulate(columns, {name: tuple(values) for name, values in edges.items()})
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
 def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return columns of one of the compact tables, a parquet file; a ValueError if it is missing or broken."""
     if not path.is_file():
@@ -221,19 +183,13 @@ def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
             "no part of the package; recordings of your own are read in the formats of docs/data.md."
         )
-    table = _read_parquet(path, names)
-    return {name: table[name].to_numpy() for name in names}
-
-
-def _read_parquet(path: Path | str, names: tuple[str, ...]) -> pa.Table:
-    """Return the table of a parquet file, which is to have these columns."""
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
     if missing := [name for name in names if name not in table.column_names]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
-    return table
+    return {name: table[name].to_numpy() for name in names}
 
 
 def synthetic_traffic(seconds: float = 12.0, lanes: int = 3, per_lane: int = 3) -> Trajectories:

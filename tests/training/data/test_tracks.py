@@ -5,7 +5,6 @@ import pytest
 
 from tests.training.data.recordings import bend, cutting_in
 from tests.training.shared_data import DATA, needs_data
-from training.data.formats import load_ngsim
 from training.data.road_axis import estimate_lane_edges, fit_road_axis
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.data.table import (
@@ -15,12 +14,10 @@ from training.data.table import (
     NOBODY,
     SCENES_FILE,
     infer_motion,
-    read_trajectories,
     resample_tracks,
     smooth_positions,
     synthetic_traffic,
     tabulate,
-    write_trajectories,
 )
 
 GOOD = {
@@ -36,17 +33,6 @@ GOOD = {
     "lane": 1,
     "leader": [2, NOBODY, NOBODY],
 }
-
-
-def test_tables_survive_a_file(ngsim, tmp_path):
-    table = load_ngsim(ngsim[0])
-    write_trajectories(table, tmp_path / "table.parquet")
-    again = read_trajectories(tmp_path / "table.parquet")
-    assert again.edges == table.edges
-    for name in COLUMNS:
-        assert (getattr(again, name) == getattr(table, name)).all()
-    with pytest.raises(ValueError, match=r"Cannot read .*none"):
-        read_trajectories(tmp_path / "none.parquet")
 
 
 def test_a_table_is_sorted_and_checked():
