@@ -119,7 +119,7 @@ def test_a_covering_ensemble_has_at_most_30_refits_the_first_and_the_last_among_
     assert (few.covering_ensemble().log_prob(x) == few.ensemble().log_prob(x)).all()
 
 
-def test_an_ensemble_of_mixtures_in_other_coordinates_or_of_nothing() -> None:
+def test_an_ensemble_of_nothing_or_of_what_is_no_mixture() -> None:
     fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 2.0))
     base = FittedDistribution(distribution=fit, refits=(fit, refit), events=COUNTS, family="1 component")
     with pytest.raises(ValueError, match="There are no refits"):
@@ -127,12 +127,6 @@ def test_an_ensemble_of_mixtures_in_other_coordinates_or_of_nothing() -> None:
     beta = BetaDistribution([2.0], [2.0], [-9.0], [9.0])
     with pytest.raises(ValueError, match="needs refits that are Gaussian mixtures"):
         replace(base, refits=(fit, beta)).ensemble()
-    logs = TruncatedGaussianMixture.from_dict({**fit.to_dict(), "low": [1.0], "high": [9.0], "coordinates": ["log"]})
-    plain = TruncatedGaussianMixture(fit.weights, fit.means, fit.covariances, [1.0], [9.0])
-    both = replace(base, distribution=logs, refits=(logs, plain)).ensemble()
-    x = np.linspace(1.5, 5.0, 9)[:, None]
-    mean = 0.5 * (np.exp(logs.log_prob(x)) + np.exp(plain.log_prob(x)))
-    np.testing.assert_allclose(np.exp(both.log_prob(x)), mean, rtol=1e-9)
 
 
 def test_a_refit_may_have_coordinates_of_its_own_also_in_a_file() -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtri_exp
 
-from rare_envs.distributions.coordinates import Coordinates
-from rare_envs.distributions.mixture import CHUNK, TruncatedGaussianMixture
+from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
+from rare_envs.distributions.mixture import CHUNK, PooledMixture, TruncatedGaussianMixture, pool_mixtures
 
 
 def random_mixture(seed: int, components: int, d: int, low: float, high: float) -> TruncatedGaussianMixture:
@@ -68,9 +68,28 @@ CUT_2D = random_mixture(2, 3, 2, -1.0, 2.0)
 TAIL = random_mixture(3, 2, 2, 5.0, 7.0)
 CUT_3D = random_mixture(4, 2, 3, -1.5, 2.5)
 CUT_IN = make_cut_in(2, 3)
+NAMES = ("speed", "lead_speed", "gap")
+ROAD: dict[str, Any] = {"low": [0.0, 0.0, 1.0], "high": [45.0, 45.0, 150.0], "names": NAMES}
+IN_ORDER = Coordinates(
+    **ROAD, kinds=("plain", ClosingSpeed("speed", "gap"), "log"), order=("speed", "gap", "lead_speed")
+)
+LOG_GAP = Coordinates(**ROAD, kinds=("plain", "plain", "log"))
+PLAIN = Coordinates(ROAD["low"], ROAD["high"], ("plain",) * 3)  # a file may leave the names of plain columns out
+IN_CLOSING = TruncatedGaussianMixture([1.0], [[15.0, 3.0, 0.1]], [np.diag([4.0, 0.2, 0.1])], coordinates=IN_ORDER)
+IN_LOG_GAP = TruncatedGaussianMixture(
+    [0.7, 0.3],
+    [[15.0, 15.0, 3.0], [25.0, 24.0, 3.5]],
+    [[[4.0, 3.0, 0.2], [3.0, 4.0, 0.1], [0.2, 0.1, 0.2]], np.diag([4.0, 9.0, 0.1])],
+    coordinates=LOG_GAP,
+)
+IN_PLAIN = TruncatedGaussianMixture([1.0], [[14.0, 14.0, 30.0]], [np.diag([9.0, 9.0, 100.0])], coordinates=PLAIN)
+POOL = pool_mixtures([IN_CLOSING, IN_LOG_GAP, IN_LOG_GAP, IN_PLAIN])
+"""Of different coordinates."""
 plain = pytest.mark.parametrize("mixture", [WIDE, CUT_2D, TAIL, CUT_3D], ids=["wide", "cut", "tail", "cut_3d"])
 every = pytest.mark.parametrize(
-    "mixture", [CUT_2D, TAIL, CUT_3D, FOLLOWING, CUT, CUT_IN], ids=["2d", "tail", "3d", "following", "cut", "cut_in"]
+    "mixture",
+    [CUT_2D, TAIL, CUT_3D, FOLLOWING, CUT, CUT_IN, POOL],
+    ids=["2d", "tail", "3d", "following", "cut", "cut_in", "pool"],
 )
 
 
@@ -267,6 +286,26 @@ def test_json_round_trip_is_exact(mixture: TruncatedGaussianMixture) -> None:
     assert (copy.log_prob(x) == mixture.log_prob(x)).all()
     with pytest.raises(ValueError, match="read-only"):
         mixture.means[0, 0] = 3.0
+
+
+def test_the_density_is_the_mean_of_the_densities() -> None:
+    """Another order of the columns cuts a mixture otherwise at the box, beyond which lie 1e-3 and less of these."""
+    assert isinstance(POOL, PooledMixture)
+    assert POOL.shares.tolist() == [0.25, 0.5, 0.25]
+    x = POOL.sample(2000, np.random.default_rng(0))
+    mean = np.mean([np.exp(each.log_prob(x)) for each in (IN_CLOSING, IN_LOG_GAP, IN_LOG_GAP, IN_PLAIN)], axis=0)
+    np.testing.assert_allclose(np.exp(POOL.log_prob(x)), mean, rtol=5e-3)
+    assert POOL.log_prob([[50.0, 10.0, 10.0]])[0] == -np.inf
+
+
+def test_pools_that_cannot_be_are_refused() -> None:
+    other = TruncatedGaussianMixture([1.0], [[0.0] * 3], [np.eye(3)], [-1.0] * 3, [1.0] * 3)
+    with pytest.raises(ValueError, match="same box, but mixtures 0 and 1 differ"):
+        pool_mixtures([IN_CLOSING, other])
+    backward = Coordinates(**ROAD, kinds=(ClosingSpeed("lead_speed", "gap"), "plain", "log"), order=NAMES[::-1])
+    against = TruncatedGaussianMixture([1.0], [[3.0, 15.0, 0.1]], [np.diag([0.2, 4.0, 0.1])], coordinates=backward)
+    with pytest.raises(ValueError, match="No order of the columns serves the coordinates of all mixtures"):
+        pool_mixtures([IN_CLOSING, against])
 
 
 GOOD: dict[str, Any] = {
