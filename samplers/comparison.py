@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, summarise_refits
 from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.weighted import (
-    add_unresolved,
+    MIN_UNITS,
     cov_inflation,
     has_independent_points,
     interval_of_sum,
@@ -29,6 +29,7 @@ from samplers.output import (
     to_json_value,
 )
 from samplers.problem import FloatArray, Problem, check_whole, names_of_columns
+from samplers.replicate import UNRESOLVED_SHARE
 from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
 from samplers.sample import Interval, degrees_of_freedom, effective_number, zero_hit_bound
@@ -285,13 +286,19 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     own = _error(np.bincount(units, weights=weights, minlength=sample.n_units).astype(np.float64))
     factor = cov_inflation(either, own / either.p if either.p > 0 else math.inf)
     single = has_independent_points(sample)
-    a, b = (_side(total, factor, single, either) for total in totals)
+    a, b = (_side(total, totals, factor, single, either) for total in totals)
     few = [
         f"{name} failed in no draw" if s.ess == 0 else f"{name} failed in only {s.ess:.0f} effective draws"
         for name, s in (("A", a), ("B", b))
         if s.ess < MIN_SIDE_ESS
     ]
     about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
+    for name, own, s in (("A", totals[0], a), ("B", totals[1], b)):
+        most, where = _find_missed(own, totals, either)
+        if most > UNRESOLVED_SHARE * s.p > 0:
+            about.append(
+                f"{name} may fail more often by up to {most:.1e} in {' and '.join(where)}, where it hardly did."
+            )
     interval = _ratio_interval(totals, factor, single, either)
     n_sim = problem.n_sim - (0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim)
     return Comparison(
@@ -337,14 +344,37 @@ def _ratio(a: float, b: float) -> float:
     return math.inf if a > 0 else math.nan
 
 
-def _side(totals: FloatArray, factor: float, single: bool, either: Estimate) -> Side:
-    """Return the probability that unit totals (n_units,) add up to."""
-    p, ess = float(totals.sum()), effective_number(totals)
+def _find_missed(own: FloatArray, totals: FloatArray, either: Estimate) -> tuple[float, list[str]]:
+    """Return how much strata may add to a kind of failure that they hardly showed, and their names; 0 without strata.
+
+    That is the root of the sum of (w_k h_k s_k)^2, h_k the upper end of P[A or B fails | stratum], s_k the bound of a
+    share that none of the effective failing draws there had (1 where that probability is not resolved).
+
+    Args:
+        own: Unit totals of the kind, (n_units,).
+        totals: Those of A and B, (2, n_units).
+        either: Estimate of P[A or B fails].
+    """
+    squares, names, first = 0.0, list[str](), 0
+    for part in either.parts:
+        units = slice(first, first + part.n_units)
+        first = units.stop
+        if part.resolved and effective_number(own[units]) >= MIN_UNITS:
+            continue
+        draws = round(effective_number(totals.max(axis=0)[units])) if part.resolved else 0
+        squares += (part.share * part.interval[1] * zero_hit_bound(draws, either.confidence)) ** 2
+        names.append(part.name)
+    return math.sqrt(squares), names
+
+
+def _side(own: FloatArray, totals: FloatArray, factor: float, single: bool, either: Estimate) -> Side:
+    """Return the probability that the unit totals of A or of B, (n_units,) of (2, n_units), add up to."""
+    p, ess = float(own.sum()), effective_number(own)
     if p == 0:
         return Side(p=0.0, interval=(0.0, either.interval[1]), cov=math.inf, ess=0.0)
-    cov = factor * _error(totals) / p
+    cov = factor * _error(own) / p
     low, high = interval_of_sum(p, cov, ess, single, either.confidence)
-    high = float(add_unresolved(either, *np.array([[either.gamma], [p], [high]]))[0])
+    high = min(1.0, p + math.hypot(high - p, _find_missed(own, totals, either)[0]))
     return Side(p=p, interval=(low, high), cov=cov, ess=ess)
 
 
@@ -357,6 +387,9 @@ def _ratio_interval(totals: FloatArray, factor: float, single: bool, either: Est
     if p_a == 0 or p_b == 0 or not apart.any():
         # none of `ess` effective draws was of the kind that is missing: its share is at most
         share = zero_hit_bound(max(round(effective_number(totals.max(axis=0))), 1), either.confidence)
+        if either.parts:
+            share = _find_missed(np.zeros_like(totals[0]), totals, either)[0] / max(p_a, p_b)
+            share = share if min(p_a, p_b) == 0 else min(share, 1 - 1e-9)
         if p_a == 0:
             return 0.0, share
         return (1 / share, math.inf) if p_b == 0 else (1 - share, 1 / (1 - share))
@@ -364,8 +397,11 @@ def _ratio_interval(totals: FloatArray, factor: float, single: bool, either: Est
     spread, ratio = factor * _error(z), float(p_a / p_b)
     ess = effective_number(np.where(apart, np.abs(z), 0.0))
     quantile = float(stdtrit(degrees_of_freedom(ess, single), 0.5 + either.confidence / 2))
-    half = min(quantile * spread, MAX_LOG)
-    return ratio * math.exp(-half), ratio * math.exp(half)
+    up_a, up_b = (
+        math.log1p(_find_missed(own, totals, either)[0] / p) for own, p in zip(totals, (p_a, p_b), strict=True)
+    )
+    low, high = (min(math.hypot(quantile * spread, up), MAX_LOG) for up in (up_b, up_a))
+    return ratio * math.exp(-low), ratio * math.exp(high)
 
 
 def _error(totals: FloatArray) -> float:

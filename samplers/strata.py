@@ -270,9 +270,8 @@ class _Sum:
             about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
             return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
-        if (
-            found.p == 0 < old.p and found.counts is not None and not is_resolved(old)
-        ):  # plain draws say that it is rare
+        if found.p == 0 < old.p and found.counts is not None and not is_resolved(old):
+            # plain draws say that what a search has not resolved is rare
             high = max(zero_hit_bound(drawn, self.goal.confidence), old.p)
             return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
         if found.p == 0 == old.p:

@@ -406,6 +406,26 @@ def test_two_sums_are_compared():
         assert side.interval[0] < p < side.interval[1]
 
 
+def test_a_stratum_in_which_one_of_two_hardly_failed_may_add_to_it():
+    """A fails in 0.1 of stratum a, B in 5e-4, which 500 draws meet in one run of five; both in 0.3 of a rare one."""
+    shares, at = (0.9998, 2e-4), norm.isf((0.1, 5e-4, 0.3))
+
+    def fails(i, column):
+        strata = zip("ab", shares, ((at[i], column), (at[2], 0)), strict=True)
+        return StratifiedProblem(
+            [
+                Stratum(name, w, FunctionProblem(lambda x, level=level, j=j: level - x[:, j], 2))
+                for name, w, (level, j) in strata
+            ]
+        )
+
+    p = [shares[0] * q + shares[1] * 0.3 for q in (0.1, 5e-4)]
+    runs = [samplers.compare(fails(0, 0), fails(1, 1), "mc", seed=seed, max_sim=4000) for seed in range(20)]
+    assert sum(run.b.interval[0] <= p[1] <= run.b.interval[1] for run in runs) >= 18
+    assert sum(run.interval[0] <= p[0] / p[1] <= run.interval[1] for run in runs) >= 18
+    assert any("B may fail more often by up to" in text and "in a, where" in text for text in runs[0].warnings)
+
+
 def test_kinds_of_failure_and_failing_points():
     result = samplers.estimate(even(), "two-stage", seed=0, max_sim=4000)
     shares = result.shares(lambda x: np.array(["a", "b"])[x[:, 0].astype(int)].tolist())
