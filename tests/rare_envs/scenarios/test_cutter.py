@@ -1,5 +1,6 @@
 """The cutter of `CutIn-v1`, by pencil and paper: when it turns back, when it goes on, and what it never does."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.special import ndtr, ndtri
 from torch import Tensor
 
 import rare_envs
+from rare_envs.control.human_driver import ATTENTIVE_IDM
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT, CUT_IN, CUT_IN_V1, CUTTER_IDM, CutterModel
 from rare_envs.simulation import World, drive
@@ -18,6 +20,9 @@ from rare_envs.traffic.state import State
 from tests.rare_envs.traffic_states import F64, tensor
 
 NAMES = [each.name for each in CUT_IN_V1.parameters]
+STEADY_IDM = replace(ATTENTIVE_IDM, desired_speed=1.0)
+STEADY = CutterModel(idm=STEADY_IDM).scenario()
+"""Its cutter wishes for no more than the speed that it begins with: ways with pencil and paper."""
 KEEPS = {"lead_speed": 20.0, "lead_gap": 150.0, "lead_braking": 9.0}  # a lead that nobody minds
 UNSEEN = {"attention": ATTENTION_LIMIT - 1.0}
 
@@ -35,11 +40,11 @@ def point(**given: float) -> Tensor:
     return tensor(*(({**usual, **KEEPS, **given}).get(name, 0.0) for name in NAMES))[None]
 
 
-def states(x: Tensor, scenario: Scenario = CUT_IN_V1) -> list[State]:
+def states(x: Tensor, scenario: Scenario = STEADY) -> list[State]:
     return [each.state for each in drive(World(scenario), Coasting(), x)]
 
 
-def across(x: Tensor, scenario: Scenario = CUT_IN_V1) -> np.ndarray:
+def across(x: Tensor, scenario: Scenario = STEADY) -> np.ndarray:
     """Return y of the cutter, at each tick."""
     return np.array([each.y[0, 1].item() for each in states(x, scenario)])
 
@@ -84,7 +89,7 @@ def test_it_turns_back_in_front_of_an_ego_that_would_have_to_brake_hard() -> Non
     """5 m/s faster, the ego needs over 2 m/s^2 from 25 / 4 m = 6.25 m on: 10 m - 5 t is below it from tick 8 on."""
     y = across(point(ego_speed=25.0, cut_in_gap=10.0))
     assert y[:15] == pytest.approx(FREE[:15], abs=1e-12) and y[15] > y[14]
-    assert across(point(ego_speed=25.0, cut_in_gap=10.0), CutterModel(most_braking=1e9).scenario())[15] < y[14]
+    assert across(point(ego_speed=25.0, cut_in_gap=10.0), CutterModel(idm=STEADY_IDM, most_braking=1e9).scenario())[15] < y[14]
 
 
 class Slowing(Coasting):
@@ -210,7 +215,8 @@ def test_without_looks_and_heuristic_and_braking_it_is_the_script_of_the_first_v
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", base="i80").base.sample(400, np.random.default_rng(2))
     )
     rest = tensor(4.0, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0).expand(400, -1)
-    script = CutterModel(looks=False, idm=CUTTER_IDM, coolness=None).scenario()
+    own_speed = replace(CUTTER_IDM, desired_speed=1.0)  # no faster than at the start
+    script = CutterModel(looks=False, idm=own_speed, coolness=None).scenario()
     for one, other in zip(states(torch.cat((x, rest), dim=1), script), states(x, CUT_IN), strict=True):
         for mine, theirs in zip(one[:4], other[:4], strict=True):
             torch.testing.assert_close(mine, theirs, rtol=0.0, atol=1e-9)
@@ -222,6 +228,13 @@ def test_the_cutter_of_the_human_kind_does_not_brake_for_the_gap_it_has_chosen()
     script = CutterModel(idm=CUTTER_IDM, coolness=None).scenario()
     human, scripted = (states(x, each)[20].speed[0, 1].item() for each in (CUT_IN_V1, script))
     assert scripted < 20.0 - 2.0 * 2.0 and human > 20.0 - 2.0 * 1.5
+
+
+def test_the_cutter_speeds_up_behind_a_faster_lead_as_human_drivers_do() -> None:
+    """At 20 m/s, far behind a lead at 30, by a (1 - (v / v0)^4) = 0.87 m/s^2; at 33 it is content."""
+    x = point(lead_speed=30.0, lead_gap=100.0)
+    start, later = (states(x, CUT_IN_V1)[tick].speed[0, 1].item() for tick in (0, 10))
+    assert start == 20.0 and later - start == pytest.approx(1.0 - (20.0 / (120 / 3.6)) ** 4, abs=0.06)
 
 
 def test_drivers_take_the_pedals_and_not_the_looks() -> None:

@@ -77,8 +77,8 @@ def test_cutter_arrives_in_the_lane_and_minds_its_lead() -> None:
     assert state.speed[0, 2].item() == 12.0
 
 
-def drive_straight(duration: float, offset: float = 3.0, speed: float = 30.0, dt: float = 0.05) -> torch.Tensor:
-    """Return y of a cutter that keeps its speed, at each tick from the start on."""
+def drive_straight(duration: float, offset: float = 3.0, speed: float = 34.0, dt: float = 0.05) -> torch.Tensor:
+    """Return y of a cutter that keeps its speed, as fast as it wishes, at each tick from the start on."""
     world = World(CUT_IN_V1, clock=Clock(dt, 1.5 * duration))
     x = tensor(20.0, speed, speed, 40.0, 150.0, offset, duration, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0)
     return torch.stack([each.state.y[0, 1] for each in drive(world, IDM(), x[None])])

@@ -38,7 +38,7 @@ def read_i24():
 @needs_data("us101_cut_in_events.csv", "ngsim_us101_scenes.parquet", "i80_coifman.parquet", "i24_cut_ins.csv")
 @pytest.mark.parametrize(("site", "followers", "cutters"), [("us101", 38, 35), ("i80", 50, 50), ("i24", 98, 0)])
 def test_drivers_go_on_as_recorded_ones_did(site, followers, cutters):
-    """Root mean square errors of followers 0.68, 0.70, 0.47 m/s^2, of cutters 0.69 and 0.53; nobody braked hard."""
+    """Root mean square errors of followers 0.68, 0.70, 0.47 m/s^2, of cutters 0.55 and 0.43; nobody braked hard."""
     found = check_answers(*(read_i24() if site == "i24" else read_site(site)))
     assert [found.get(who, {"events": 0})["events"] for who in ("followers", "cutters")] == [followers, cutters]
     assert found["followers"]["rmse"] <= (0.55 if site == "i24" else 0.75)
@@ -53,7 +53,8 @@ def test_drivers_go_on_as_recorded_ones_did(site, followers, cutters):
 @pytest.mark.parametrize("site", SITES)
 def test_the_script_that_brakes_for_its_lead_is_refuted(site, monkeypatch):
     """Root mean square error of the cutter of `CutIn-v0`: 1.31 and 0.94 m/s^2."""
-    monkeypatch.setitem(SCENARIOS, "rare_envs/CutIn-v1", CutterModel(idm=CUTTER_IDM, coolness=None).scenario())
+    script = replace(CUTTER_IDM, desired_speed=1.0)  # no faster than at the start
+    monkeypatch.setitem(SCENARIOS, "rare_envs/CutIn-v1", CutterModel(idm=script, coolness=None).scenario())
     monkeypatch.setattr(checks, "DRAWS", 1)
     assert check_answers(*read_site(site))["cutters"]["rmse"] > 0.75
 
