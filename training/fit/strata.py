@@ -6,7 +6,7 @@ near-crashes of 3.219e6 km were lane changes of drivers who had not seen the oth
 
     share = 44 / (3.219e6 km * cut-ins per km * P[near-crash | not looked]).
 
-P was simulated: 0.321 in the traffic of US 101, 0.429 in that of I-80. The logarithm of the share has a standard
+P was simulated: 0.321 in the traffic of US 101, 0.440 in that of I-80. The logarithm of the share has a standard
 deviation of 0.74: 44 events 0.15, traffic of the study thinner by up to 2.7 log(2.7) / 2, changes per km by a factor
 of 2 log(2) / 2, and how soon drivers notice 0.4. A refit draws a share anew.
 
@@ -57,9 +57,9 @@ UNSEEN_EVENTS, UNSEEN_KM = 44, 3.219e6
 """Near-crashes of the 100-Car study at lane changes of subjects who did not see the other vehicle, and its km."""
 US101_PER_KM = 0.26
 """Cut-ins per km on US 101."""
-NEAR_IF_UNSEEN = {"us101": 0.321, "i80": 0.429}
-"""Share of changes without a look that are near-crashes, of 200,000 draws of the stratum with `human` (+- 0.001); US
-101's is the usual one."""
+NEAR_IF_UNSEEN = {"us101": 0.321, "i80": 0.440}
+"""Share of changes without a look that are near-crashes, of 200,000 draws of the stratum with `human` (+- 0.001), which
+`python -m benchmarks.driving.human_calibration` drives; US 101's is the usual one."""
 UNSEEN_LOG_SD = math.sqrt(1.0 / UNSEEN_EVENTS + (math.log(2.7) / 2) ** 2 + (math.log(2.0) / 2) ** 2 + 0.4**2)
 """Of the share of those who do not look: see above."""
 UNSEEN_COMPONENTS, UNSEEN_STARTS = 3, 2
