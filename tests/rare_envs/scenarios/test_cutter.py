@@ -89,7 +89,8 @@ def test_it_turns_back_in_front_of_an_ego_that_would_have_to_brake_hard() -> Non
     """5 m/s faster, the ego needs over 2 m/s^2 from 25 / 4 m = 6.25 m on: 10 m - 5 t is below it from tick 8 on."""
     y = across(point(ego_speed=25.0, cut_in_gap=10.0))
     assert y[:15] == pytest.approx(FREE[:15], abs=1e-12) and y[15] > y[14]
-    assert across(point(ego_speed=25.0, cut_in_gap=10.0), CutterModel(idm=STEADY_IDM, most_braking=1e9).scenario())[15] < y[14]
+    bold = CutterModel(idm=STEADY_IDM, most_braking=1e9).scenario()
+    assert across(point(ego_speed=25.0, cut_in_gap=10.0), bold)[15] < y[14]
 
 
 class Slowing(Coasting):
