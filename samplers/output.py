@@ -144,7 +144,7 @@ def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         return data
     ((kind, content),) = data.items()
     if kind == "float":
-        return float(content)
+        return math.nan if content == "nan" else float(content)  # one object: results are equal to what was saved
     if kind == "array":
         return arrays[content]
     if kind in ("list", "tuple"):

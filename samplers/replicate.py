@@ -31,8 +31,8 @@ from samplers.sample import (
     Sample,
     Status,
     binomial_cov,
+    clopper_pearson,
     effective_number,
-    zero_hit_bound,
 )
 
 MIN_REPLICATES = 5
@@ -379,10 +379,16 @@ def _settle(part: Part, confidence: float) -> Part:
     """Return a part that says whether it is resolved; if not, p_k may be as large as its base draws allow."""
     found, resolved = part.outcome, is_resolved(part.outcome)
     if found.p > 0 and not resolved:
-        high = max(found.interval[1], zero_hit_bound(found.base_draws, confidence))
+        high = max(found.interval[1], clopper_pearson(0, found.base_draws, confidence)[1])
         found = replace(found, interval=(found.interval[0], high))
     n_units = 0 if found.sample is None else found.sample.n_units
     return replace(part, outcome=found, resolved=resolved, n_units=n_units)
+
+
+def may_add(parts: Sequence[Part], p: float) -> float:
+    """Return what parts that are not resolved may add to p > 0; 0 where that is less than a tenth of p."""
+    most = math.hypot(*(part.share * part.interval[1] for part in parts if not part.resolved))
+    return most if most > UNRESOLVED_SHARE * p > 0 else 0.0
 
 
 def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...]) -> Outcome:
@@ -412,8 +418,7 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
         resolved = p == 0 or part.outcome.status is not Status.NO_HITS
         (warnings if resolved else remarks).extend(f"{part.name}: {text}" for text in part.outcome.warnings)
         remarks += [f"{part.name}: {text}" for text in part.outcome.remarks]
-    most = math.hypot(*(part.share * part.interval[1] for part in parts if not part.resolved))
-    if most > UNRESOLVED_SHARE * p > 0:
+    if most := may_add(parts, p):
         names = " and ".join(part.name for part in parts if not part.resolved)
         remarks.append(f"{names} may add up to {most:.1e}; the c.o.v. is that of the failures met.")
     simulated = [part for part in parts if part.n_sim]

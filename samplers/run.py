@@ -33,12 +33,13 @@ from samplers.replicate import (
     Replicate,
     combine,
     count_simulations,
+    may_add,
     meets_target,
     needs_another,
     outcomes_of,
 )
 from samplers.result import Estimate
-from samplers.sample import Failures, Interval, SimulatedPoints, Status, gain_over_monte_carlo
+from samplers.sample import Failures, Interval, SimulatedPoints, Status, clopper_pearson, gain_over_monte_carlo
 from samplers.strata import SumOfStrata
 
 MOST_SIMULATIONS = 10**12
@@ -385,7 +386,7 @@ class Run:
             confidence=goal.confidence,
             gamma=goal.gamma,
             n_sim=self._n_sim,
-            gain=gain_over_monte_carlo(whole.p, whole.cov, self._n_sim),
+            gain=math.nan if may_add(whole.parts, whole.p) else gain_over_monte_carlo(whole.p, whole.cov, self._n_sim),
             failures=self._failures,
             method=self._choice.method,
             seed=self._seed,
@@ -401,8 +402,17 @@ class Run:
 
     def _find_ends(self, outcome: Outcome) -> Interval:
         """Return the interval; points without an outcome that only bound p are not in its lower end."""
-        low, high = outcome.interval
-        return low * (1 - outcome.no_outcome_share) if self._on_error == "bound" else low, high
+        (low, high), known = outcome.interval, 1 - outcome.no_outcome_share
+        if self._on_error != "bound":
+            return low, high
+        if outcome.parts:
+            p = [part.share * part.p * (1 - part.outcome.no_outcome_share) for part in outcome.parts]
+            lows = [part.share * self._find_ends(part.outcome)[0] for part in outcome.parts]
+            return max(0.0, math.fsum(p) - math.hypot(*np.subtract(p, lows))), high  # as in `sum_strata`
+        if outcome.counts is None:
+            return low * known, high
+        hits, n = outcome.counts
+        return clopper_pearson(round(hits * known), n, self._goal.confidence)[0], high
 
     def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""

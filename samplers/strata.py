@@ -48,7 +48,7 @@ from samplers.replicate import (
     pool_counts,
     sum_strata,
 )
-from samplers.sample import Level, Status, zero_hit_bound
+from samplers.sample import Level, Status, clopper_pearson
 
 PILOT_SHARE = 0.25
 """Share of max_sim for the pilots."""
@@ -272,10 +272,11 @@ class _Sum:
             return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
         if found.p == 0 < old.p and found.counts is not None and not is_resolved(old):
             # plain draws say that what a search has not resolved is rare
-            high = max(zero_hit_bound(drawn, self.goal.confidence), old.p)
+            high = max(clopper_pearson(0, drawn, self.goal.confidence)[1], old.p)
             return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
         if found.p == 0 == old.p:
-            return replace(found, interval=(0.0, zero_hit_bound(drawn, self.goal.confidence)), base_draws=drawn), n
+            interval = clopper_pearson(0, drawn, self.goal.confidence)
+            return replace(found, interval=interval, base_draws=drawn), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost
             return dilute(old, found, n_old / (n_old + n)), n_old + n
         return replace(found, base_draws=drawn), n

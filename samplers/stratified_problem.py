@@ -15,7 +15,15 @@ from scipy.special import ndtr, ndtri
 from samplers.analysis.reweight import FittedBase, find_fitted_base
 from samplers.distributions import LOG_TWO_PI, DrawnByItsMap
 from samplers.evaluate import find_chunk_size
-from samplers.problem import FloatArray, Problem, check_number, check_shares, names_of_columns, one_per_row
+from samplers.problem import (
+    FloatArray,
+    Problem,
+    check_number,
+    check_shares,
+    names_of_columns,
+    one_per_row,
+    read_strata,
+)
 from samplers.run import check_problem
 
 N_REFITS = 100
@@ -59,7 +67,8 @@ class StratifiedProblem:
     `estimate` gives every stratum runs of its own and most simulations to those that the error of the sum comes from;
     `Estimate.parts` has each p_k. The first column of x is `stratum`: k + v for stratum k = 0, 1, ... and v uniform
     below 1, which does not matter to f_k; then come the columns of its problem, and standard normal ones up to the
-    length of the longest. Terms of problems are not offered. Where shares have an error (`Stratum.log_sd`) or bases
+    length of the longest. Where the base of a problem has strata of its own, these are strata of the sum, "cut-in:
+    unseen" say. Terms of problems are not offered. Where shares have an error (`Stratum.log_sd`) or bases
     were fitted, the base has refits: a share with an error is log-normal, those without take what is left, in
     proportion, and where all have one they are scaled to add up to 1.
 
@@ -83,7 +92,7 @@ class StratifiedProblem:
     """
 
     def __init__(self, strata: Sequence[Stratum]) -> None:
-        self.strata = tuple(strata)
+        self.strata = tuple(strata) if isinstance(strata, Sequence) else ()
         if not self.strata or not all(isinstance(each, Stratum) for each in self.strata):
             raise ValueError(f"Expected at least one samplers.Stratum(name, share, problem), got {strata!r}.")
         self.base = StratifiedBase(self.strata, tuple(float(each.share) for each in self.strata))
@@ -182,8 +191,8 @@ class StratifiedBase(DrawnByItsMap):
         return 1 + max(int(each.problem.dim) for each in self.problems)
 
     @cached_property
-    def strata(self) -> tuple[PaddedStratum, ...]:
-        """The strata over the columns of the whole; those of a refit have the refits of their bases."""
+    def _problem_strata(self) -> tuple[PaddedStratum, ...]:
+        """Those of the problems over the columns of the whole; those of a refit have the refits of their bases."""
         found = []
         for number, (each, share) in enumerate(zip(self.problems, self.shares, strict=True)):
             own, fitted = each.problem.base, find_fitted_base(each.problem.base)
@@ -193,13 +202,24 @@ class StratifiedBase(DrawnByItsMap):
         return tuple(found)
 
     @cached_property
+    def strata(self) -> tuple[PaddedStratum, ...]:
+        """Those of the problems, each that has strata of its own in parts."""
+        return tuple(
+            PaddedStratum(f"{each.name}: {part.name}", each.share * part.share, replace(each.base, own=part.base))
+            if part is not None
+            else each
+            for each in self._problem_strata
+            for part in read_strata(each.base.own) or (None,)
+        )
+
+    @cached_property
     def _ends(self) -> FloatArray:
         """Distribution function of the first column at 0, 1, ..., K."""
         return np.append(0.0, np.cumsum(self.shares) / math.fsum(self.shares))
 
     def _split(self, first: FloatArray) -> Iterator[tuple[PaddedStratum, NDArray[np.intp]]]:
         """Return the strata of rows with these values of the first column (n,), and their rows."""
-        rows = ((one, np.flatnonzero(np.floor(first) == number)) for number, one in enumerate(self.strata))
+        rows = ((one, np.flatnonzero(np.floor(first) == number)) for number, one in enumerate(self._problem_strata))
         return ((one, mine) for one, mine in rows if len(mine))
 
     def log_prob(self, x: FloatArray) -> FloatArray:

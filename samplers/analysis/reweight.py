@@ -152,6 +152,7 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
         new_base = base.sibling(new_base)
     if isinstance(new_base, list | tuple) or convert(new_base) is not None:
         new_base = as_distribution(new_base, sample.x.shape[1])
+    _check_strata(estimate.base, new_base)
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
     log_ratios = _log_density_ratios(estimate, new_base, sample.x)
@@ -188,6 +189,13 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
         gamma=estimate.gamma,
         ratio=p / estimate.p,
     )
+
+
+def _check_strata(base: object, new_base: object) -> None:
+    """Raise a ValueError where both bases have strata, but not the same ones in the same order."""
+    old, new = ([each.name for each in getattr(one, "strata", None) or ()] for one in (base, new_base))
+    if old and new and old != new:
+        raise ValueError(f"Expected a base with the strata {', '.join(old)}, in this order; got {', '.join(new)}.")
 
 
 def require_base(estimate: EstimateData) -> Distribution:
