@@ -34,6 +34,7 @@ import rare_envs
 import rare_envs.people
 from agents import load_ego
 from benchmarks import RESULTS
+from rare_envs.control.human_driver import ATTENTIVE_IDM
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.egos.human import HUMAN_EGOS, HumanEgo
 from rare_envs.exposure import MILLION_KM
@@ -101,6 +102,9 @@ CHANGES: Mapping[str, Change] = {
     "the cutter never looks": Change(("looked",), {}, {"looks": False}),
     "it turns back above 4 m/s^2, not 2": Change(("looked",), {}, {"most_braking": 4.0}),
     "the cutter follows its lead by IDM": Change(("looked",), {}, {"coolness": None}),
+    "it wishes for no more than its initial speed": Change(
+        _CUT_INS, {}, {"idm": replace(ATTENTIVE_IDM, desired_speed=1.0)}
+    ),
     "the lead keeps its speed": Change(("looked",), {}, {"brakings_per_km": 0.0}),
     "gaps that nobody accepts": Change(("looked",), {}, {}, "-test"),
     "gaps that nobody accepts, never looks": Change(("looked",), {}, {"looks": False}, "-test"),
@@ -185,7 +189,7 @@ def make_problem(drawn: Drawn) -> rare_envs.DrivingProblem:
     """Return the problem whose f is the outcome."""
     change, env_id = CHANGES[drawn.change], STRATA[drawn.stratum].env_id
     if change.cutter:
-        env_id = f"calibration/{'-'.join(change.cutter)}-{'-'.join(map(str, change.cutter.values()))}"
+        env_id = f"calibration/{list(CHANGES).index(drawn.change)}"
         SCENARIOS.setdefault(env_id, CutterModel(**change.cutter).scenario())
     ego: Any = drawn.ego if drawn.ego in EGOS else load_ego(drawn.ego)
     if change.driver:
