@@ -18,7 +18,6 @@ from training.fit.checks import check_predictions, mass_outside
 from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
     N_FOLDS,
-    SYSTEMS_APART,
     CoordinateSystem,
     SystemFit,
     choose_system,
@@ -32,7 +31,6 @@ from training.fit.mixture import (
     COVARIANCE_FLOOR,
     EM_STARTS,
     EVENTS_PER_COMPONENT,
-    MAX_COMPONENTS,
     SMALLEST_COMPONENT,
 )
 from training.fit.refits import FOLD_STARTS, Asked, Fit
@@ -125,18 +123,10 @@ def _fit_in_best_system(scenario: str, events: EventSet, system: str | None, ask
     names = [system.name for system in systems]
     if system not in (None, *names):
         raise ValueError(f"Unknown coordinate system {system!r}; known are {', '.join(names)}.")
-    own = parameters[events.joint.shape[1] :]
-    refitted = [each for each in systems if system in (None, each.name)]
-    selections: dict[str, Any] = {}
-    if systems_apart := [each for p in own for each in SYSTEMS_APART.get(p.name, ())]:
-        alone = EventSet(events.apart, np.arange(len(events.apart)))
-        fits, best, selections["selection_apart"] = compare_systems(alone, systems_apart, own, asked, most=1)
-        systems = tuple(each.combine(fits[best].system) for each in systems)
-        refitted = [each.combine(other) for each in refitted for other in systems_apart]
-    fits, best, selection = compare_systems(events, systems, parameters, asked)
+    fits, best, selection = _compare_systems(events, systems, parameters, asked)
     best = best if system is None else names.index(system)
     chosen = fits[best]
-    refits = refit(events, refitted, parameters, asked)
+    refits = refit(events, [each for each in systems if system in (None, each.name)], parameters, asked)
     names = [p.name for p in parameters]
     return Fit(
         distribution=chosen.distribution,
@@ -144,25 +134,21 @@ def _fit_in_best_system(scenario: str, events: EventSet, system: str | None, ask
         family=describe_family(chosen.family, refits),
         checks=check_predictions(found.name, names, events.joint, chosen.distribution, asked.seed),
         criteria={name: selection[best][name] for name in ("coordinates", "bic", "held_out_log_prob")},
-        entries={"selection": selection, **selections, "mass_outside_box": mass_outside(chosen.distribution)},
+        entries={"selection": selection, "mass_outside_box": mass_outside(chosen.distribution)},
         settings=SETTINGS,
     )
 
 
-def compare_systems(
-    events: EventSet,
-    systems: Sequence[CoordinateSystem],
-    parameters: Sequence[Parameter],
-    asked: Asked,
-    most: int = MAX_COMPONENTS,
+def _compare_systems(
+    events: EventSet, systems: Sequence[CoordinateSystem], parameters: Sequence[Parameter], asked: Asked
 ) -> tuple[list[SystemFit], int, list[dict[str, Any]]]:
-    """Return fits of `most` components at most in several systems, which is supported best, and criteria for a file."""
+    """Return fits in several systems, which is supported best, and criteria for a file."""
     fits = []
     for system in systems:
         asked.report(f"fit in the coordinates {system.name}")
-        fits.append(fit_system(events, system, parameters, asked.seed, most=most))
+        fits.append(fit_system(events, system, parameters, asked.seed))
     asked.report("held-out events")
-    held_out = [held_out_log_prob(events, system, parameters, asked.seed, most) for system in systems]
+    held_out = [held_out_log_prob(events, system, parameters, asked.seed) for system in systems]
     best = choose_system([fit.bic for fit in fits], held_out, events.clusters)
     return fits, best, [_describe_fit(*each) for each in zip(fits, held_out, strict=True)]
 

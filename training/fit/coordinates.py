@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,11 +59,9 @@ class CoordinateSystem:
             origins=tuple(self.origins.get(name, 0.0) for name in names),
         )
 
-    def combine(self, apart: CoordinateSystem) -> CoordinateSystem:
-        """Return the system with the coordinates of another for the columns fitted apart."""
-        return replace(self, name=f"{self.name}, {apart.name}", kinds={**self.kinds, **apart.kinds})
 
-
+LOG_DURATION: dict[str, CoordinateKind] = {"duration": "log"}
+"""Of lane changes: BIC 1,315 for 1,383 of plain durations on US 101 (259 changes), 711 for 735 on I-80 (131)."""
 COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
     "car_following": (
         CoordinateSystem("plain"),
@@ -75,8 +73,8 @@ COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
         ),
     ),
     "cut_in": (
-        CoordinateSystem("plain"),
-        CoordinateSystem("log gaps", {"cut_in_gap": "log", "lead_gap": "log"}),
+        CoordinateSystem("plain", LOG_DURATION),
+        CoordinateSystem("log gaps", {"cut_in_gap": "log", "lead_gap": "log", **LOG_DURATION}),
         CoordinateSystem(
             "closing speeds / sqrt(gap), log gaps",
             {
@@ -84,6 +82,7 @@ COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
                 "lead_speed": ClosingSpeed("cut_in_speed", "lead_gap"),
                 "cut_in_gap": "log",
                 "lead_gap": "log",
+                **LOG_DURATION,
             },
             ("ego_speed", "cut_in_gap", "cut_in_speed", "lead_gap", "lead_speed", "lateral_offset", "duration"),
         ),
@@ -95,10 +94,6 @@ COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
     ),
 }
 """Coordinate systems that are tried, by scenario."""
-SYSTEMS_APART: dict[str, tuple[CoordinateSystem, ...]] = {
-    "duration": (CoordinateSystem("plain duration"), CoordinateSystem("log duration", {"duration": "log"})),
-}
-"""Those for the columns fitted apart, by a parameter among these."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +105,6 @@ class SystemFit:
     """Of all columns of x."""
     candidates: Sequence[Candidate]
     """Numbers of components of the columns that are fitted together, with a BIC in units of x."""
-    bic_apart: float = 0.0
-    """The BIC of the columns fitted apart."""
 
     @property
     def bic(self) -> float:
@@ -131,17 +124,15 @@ def fit_system(
     parameters: Sequence[Parameter],
     seed: int = 0,
     starts: int | None = None,
-    most: int = MAX_COMPONENTS,
 ) -> SystemFit:
-    """Return a mixture of `most` components at most in one system; columns apart get one component of their own."""
+    """Return a mixture in one system; columns apart get one component of their own."""
     n = events.joint.shape[1]
-    components, candidates = _fit_in(system.coordinates(parameters[:n]), events.joint, seed, most, starts)
-    bic_apart = 0.0
+    components, candidates = _fit_in(system.coordinates(parameters[:n]), events.joint, seed, MAX_COMPONENTS, starts)
     if events.apart.shape[1]:
-        apart, (single, *_) = _fit_in(system.coordinates(parameters[n:]), events.apart, seed, 1, None)
-        components, bic_apart = append_independent(components, apart), single.bic
+        apart, _ = _fit_in(system.coordinates(parameters[n:]), events.apart, seed, 1, None)
+        components = append_independent(components, apart)
     mixture = TruncatedGaussianMixture(*components, coordinates=system.coordinates(parameters))
-    return SystemFit(system, mixture, candidates, bic_apart)
+    return SystemFit(system, mixture, candidates)
 
 
 def _fit_in(
@@ -155,11 +146,7 @@ def _fit_in(
 
 
 def held_out_log_prob(
-    events: EventSet,
-    system: CoordinateSystem,
-    parameters: Sequence[Parameter],
-    seed: int = 0,
-    most: int = MAX_COMPONENTS,
+    events: EventSet, system: CoordinateSystem, parameters: Sequence[Parameter], seed: int = 0
 ) -> FloatArray:
     """Return the log density of each event (n,) under a fit to the other folds of clusters; NaN where too few."""
     names = np.random.default_rng(seed).permutation(np.unique(events.clusters))
@@ -169,7 +156,7 @@ def held_out_log_prob(
         test = np.isin(events.clusters, fold)
         rest = EventSet(events.joint[~test], events.clusters[~test])
         with contextlib.suppress(ValueError):
-            fitted = fit_system(rest, system, own, seed, FOLD_STARTS, most)
+            fitted = fit_system(rest, system, own, seed, FOLD_STARTS)
             scores[test] = fitted.distribution.log_prob(events.joint[test])
     return scores
 
@@ -204,7 +191,7 @@ def refit(
 
     def fit(drawn: EventSet, _: np.random.Generator) -> SystemFit:
         fits = [fit_system(drawn, system, parameters, asked.seed, FOLD_STARTS) for system in systems]
-        return min(fits, key=lambda fit: fit.bic + fit.bic_apart)
+        return min(fits, key=lambda fit: fit.bic)
 
     return tuple(asked.refit(events, fit, lambda each: each.family))
 

@@ -66,24 +66,6 @@ def test_a_base_carries_all_that_says_what_it_is_worth_and_so_does_its_file(quic
         fitted(system="polar")
 
 
-@pytest.mark.parametrize("logarithmic", [True, False])
-def test_the_coordinate_of_the_duration_is_chosen_by_the_changes(quick, logarithmic):
-    """Durations of 200 changes, normal or log-normal with the same mean and a coefficient of variation of 0.4."""
-    rng = np.random.default_rng(3)
-    joint = np.column_stack([rng.normal(15.0, 2.0, (40, 3)), rng.uniform(5.0, 40.0, (40, 2))])
-    normal = rng.standard_normal(200)
-    duration = np.exp(np.log(5.0) - 0.08 + 0.39 * normal) if logarithmic else 5.0 + 1.2 * normal
-    events = EventSet(joint, np.arange(40), np.column_stack([rng.normal(3.2, 0.2, 200), np.clip(duration, 1.6, 11.9)]))
-    base = fit_base("cut_in", events, {}, "a test", n_refits=2)
-    word = "log duration" if logarithmic else "plain duration"
-    assert base.family.endswith(f", {word}") and base.record["coordinates"].endswith(f", {word}")
-    selection = base.record["selection_apart"]
-    assert [each["coordinates"] for each in selection] == ["plain duration", "log duration"]
-    assert min(selection, key=lambda each: each["bic"])["coordinates"] == word
-    assert base.events.used == (40, 200)
-    assert {refit.coordinates.kinds[6] for refit in base.refits} == {"log" if logarithmic else "plain"}
-
-
 def test_expected_counts_are_shares_times_events():
     """Gaps are N(10, 4^2) within [1, 150]: P[gap < 3] = (Phi(-7/4) - Phi(-9/4)) / (1 - Phi(-9/4))."""
     box = [0.0, 0.0, 1.0], [45.0, 45.0, 150.0]

@@ -13,7 +13,6 @@ from training.fit import mixture as mixture_fit
 from training.fit import refits
 from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
-    SYSTEMS_APART,
     choose_system,
     fit_system,
     held_out_log_prob,
@@ -81,9 +80,10 @@ def closing_events(n, seed=0):
 def test_the_criterion_is_that_of_the_density_of_x(monkeypatch):
     """BIC = -2 log L + (number of parameters) log n, with L the likelihood of x itself; nobody is outside the box."""
     monkeypatch.setattr(mixture_fit, "COVARIANCE_FLOOR", 0.0)
+    monkeypatch.setattr(module, "MAX_COMPONENTS", 1)
     events = closing_events(200)
     for system in (LOG_GAP, CLOSING):
-        fit = fit_system(events, system, FOLLOWING, most=1)
+        fit = fit_system(events, system, FOLLOWING)
         log_likelihood = float(fit.distribution.log_prob(events.joint).sum())
         # To what the ranges cut away (1e-4 of the mass), and six digits of the parameters.
         assert fit.bic == pytest.approx(-2.0 * log_likelihood + 9 * np.log(200), abs=0.5)
@@ -115,8 +115,7 @@ def test_columns_apart_are_independent(quick):
     joint = np.column_stack([rng.normal(15.0, 2.0, (60, 3)), rng.uniform(5.0, 40.0, (60, 2))])
     offsets = rng.normal(3.0, 0.4, 25)
     apart = np.column_stack([offsets, np.exp(1.5 + 0.3 * (offsets - 3.0) + rng.normal(0.0, 0.1, 25))])
-    system = COORDINATE_SYSTEMS["cut_in"][2].combine(SYSTEMS_APART["duration"][1])
-    fit = fit_system(EventSet(joint, np.arange(60), apart), system, CUT_IN)
+    fit = fit_system(EventSet(joint, np.arange(60), apart), COORDINATE_SYSTEMS["cut_in"][2], CUT_IN)
     covariance, mean = fit.distribution.covariances[0], fit.distribution.means[0]
     assert (covariance[5:, :5] == 0.0).all()
     logs = np.column_stack([offsets, np.log(apart[:, 1])])
@@ -165,7 +164,7 @@ def test_more_refits_where_the_number_of_components_differs(monkeypatch):
         made = iter(numbers)
 
         def fit(*_, made=made):
-            return SimpleNamespace(family=f"{next(made)} components", bic=0.0, bic_apart=0.0)
+            return SimpleNamespace(family=f"{next(made)} components", bic=0.0)
 
         monkeypatch.setattr(module, "fit_system", fit)
         families = [each.family for each in refit(events(25), [LOG_GAP], FOLLOWING, Asked())]
