@@ -31,12 +31,11 @@ from agents.learned.networks import ACTION_SIZE
 from benchmarks import RESULTS
 from benchmarks.samplers.runs import about
 from rare_envs.startup import use_one_thread
-from samplers.problem import FloatArray
 from training.imitation.evaluate import (
     BINS,
     Act,
-    DrivingStatistics,
     Realism,
+    Tallies,
     collect_statistics,
     record_statistics,
     sampling_driver,
@@ -62,21 +61,14 @@ def rule_driver(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor
     return RuleDriver().act(features, None, None, memory)
 
 
-def add_statistics(tallies: Sequence[DrivingStatistics]) -> DrivingStatistics:
-    """Return the sum of several statistics of the same scenes."""
-
-    def add(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
-        return {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
-
-    steps, vehicles, *groups = zip(*tallies, strict=True)
-    return DrivingStatistics(np.sum(steps, axis=0), np.sum(vehicles, axis=0), *(add(group) for group in groups))
+def add_statistics(runs: Sequence[Tallies]) -> Tallies:
+    """Return the sum of several tallies of the same scenes."""
+    return {name: np.sum([run[name] for run in runs], axis=0) for name in runs[0]}
 
 
-def bootstrap_errors(
-    driven: DrivingStatistics, recorded: DrivingStatistics, rng: np.random.Generator, draws: int = 200
-) -> Realism:
+def bootstrap_errors(driven: Tallies, recorded: Tallies, rng: np.random.Generator, draws: int = 200) -> Realism:
     """Return standard errors by bootstrap over scenes; scenes that share vehicles are taken as independent."""
-    scenes = len(driven.steps)
+    scenes = len(driven["steps"])
     drawn = [
         asdict(summarise_realism(driven, recorded, times))
         for times in rng.multinomial(scenes, [1 / scenes] * scenes, draws)
@@ -95,7 +87,7 @@ class Judge:
     """Comparison of drivers with people."""
 
     test: Recording
-    recorded: DrivingStatistics
+    recorded: Tallies
     """Statistics of the people in the test scenes."""
 
     def row(self, name: str, kind: str, acts: Sequence[Act]) -> Row:
@@ -103,7 +95,7 @@ class Judge:
         runs = [collect_statistics(self.test, act, SECONDS) for act in acts]
         return {"name": name, "kind": kind, **self.figures({time: [run[time] for run in runs] for time in SECONDS})}
 
-    def figures(self, runs: dict[float, list[DrivingStatistics]]) -> Row:
+    def figures(self, runs: dict[float, list[Tallies]]) -> Row:
         """Return values and standard errors of several runs together, and the collision rate of each."""
         out: Row = {}
         for seconds, parts in runs.items():

@@ -32,7 +32,7 @@ from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.startup import use_one_thread
 from training import sb3_vec_env, train_ego
 from training.checkpoints import load_checkpoint
-from training.ego_training import Retraining, check_retrainable, continue_settings, restore_parameters
+from training.ego_training import Retraining, check_retrainable, restore_parameters
 
 ENV = "rare_envs/CutIn-v0"
 STEPS, ROWS = 64, 8
@@ -125,20 +125,21 @@ def test_a_resumed_training_ends_alike(
     algo: str, steps: int, checkpoint: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped half-way, with updates, and new scenarios for episodes that ended (after 0.8 s), before and after."""
+    ids = ("rare_envs/HardBrake-v0", ENV) if algo == "ppo" else ENV
     common: dict[str, Any] = {"algo": algo, "steps": steps, "num_envs": ROWS, "progress": False, "horizon": 0.8}
-    whole = train_ego(ENV, out=tmp_path / "whole.zip", **common)
+    whole = train_ego(ids, out=tmp_path / "whole.zip", **common)
     stop_after(monkeypatch, checkpoint)
     with pytest.raises(Stopped):
-        train_ego(ENV, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
+        train_ego(ids, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
     monkeypatch.undo()
     assert not (tmp_path / "ego.zip").exists()
     with pytest.raises(ValueError, match=r"There is an unfinished training in .* go on with --resume"):
-        train_ego(ENV, out=tmp_path / "ego.zip", **common)
+        train_ego(ids, out=tmp_path / "ego.zip", **common)
     with pytest.raises(ValueError, match=r"with other arguments \(seed=0\)"):
-        train_ego(ENV, out=tmp_path / "ego.zip", resume=True, **{**common, "seed": 1})
+        train_ego(ids, out=tmp_path / "ego.zip", resume=True, **{**common, "seed": 1})
     np.random.seed(5)  # noqa: NPY002  (what another process would have drawn of the global generators)
     torch.manual_seed(5)
-    resumed = train_ego(ENV, out=tmp_path / "ego.zip", resume=True, **common)
+    resumed = train_ego(ids, out=tmp_path / "ego.zip", resume=True, **common)
     assert torch.equal(weights(resumed), weights(whole))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ego.zip", "whole.zip"]
 
@@ -212,18 +213,6 @@ def test_an_ego_is_trained_in_several_scenarios(tmp_path: Path) -> None:
             train_ego(wrong, out=tmp_path / "none.zip", **common)
     with pytest.raises(ValueError, match="one environment to train on in"):
         train_ego(ids, out=tmp_path / "none.zip", retraining=Retraining(whole, FAILURE), **common)
-
-
-def test_a_resumed_training_in_several_scenarios_ends_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ids = ("rare_envs/HardBrake-v0", ENV)
-    common: dict[str, Any] = {"steps": 480, "num_envs": ROWS, "progress": False, "horizon": 0.8}
-    whole = train_ego(ids, out=tmp_path / "whole.zip", **common)
-    stop_after(monkeypatch, 2)
-    with pytest.raises(Stopped):
-        train_ego(ids, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
-    monkeypatch.undo()
-    resumed = train_ego(ids, out=tmp_path / "ego.zip", resume=True, **common)
-    assert torch.equal(weights(resumed), weights(whole))
 
 
 def test_episodes_that_follow_begin_in_failures_too() -> None:
@@ -304,14 +293,6 @@ def test_what_does_not_fit_is_refused_before_training(egos: Callable[[str], Path
         check_retrainable(SimpleNamespace(**{**usual, "statistics": object()}), "ppo", env)
     with pytest.raises(ValueError, match=r"its action_space is 5, .* is 2"):
         check_retrainable(SimpleNamespace(**{**usual, "policy": other}), "ppo", env)
-
-
-def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> None:
-    dqn = {"learning_starts": 100, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05, "gamma": 0.9}
-    before = dict(dqn)
-    assert continue_settings(dqn) == {**dqn, "learning_starts": 0, "exploration_initial_eps": 0.05}
-    assert dqn == before
-    assert continue_settings({"n_steps": 8}) == {"n_steps": 8}  # PPO has none of these arguments
 
 
 def test_sac_keeps_its_entropy_coefficient(egos: Callable[[str], Path]) -> None:

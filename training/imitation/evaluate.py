@@ -192,19 +192,10 @@ def current_errors(recording: Recording, traffic: Traffic) -> Errors:
     return {"scene": scene, "position": position, "speed": speed, "lateral": across}
 
 
-class DrivingStatistics(NamedTuple):
-    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow."""
-
-    steps: FloatArray
-    """Vehicle-steps (S,)."""
-    vehicles: FloatArray
-    """Likewise."""
-    sums: dict[str, FloatArray]
-    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, and `ever` by vehicle, (S,) each."""
-    counts: dict[str, FloatArray]
-    """Histograms (S, bins)."""
-    squared: dict[str, FloatArray]
-    """Errors after 5 s: position [m^2], speed and lateral position, and their number, (S,) each."""
+Tallies = dict[str, FloatArray]
+"""Sums over the vehicle-steps of each of S scenes by name, (S,) each: `steps`, those with a hard brake, in collision,
+off the road and with a lane change, and of their speed; `vehicles`, and those that `ever` collide; "bins QUANTITY",
+histograms (S, bins); "error NAME", squared errors after 5 s, and their number `errors`."""
 
 
 def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
@@ -224,8 +215,8 @@ def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
     return {name: (values[where], scene[-len(where) :][where]) for name, (values, where) in quantities.items()}
 
 
-def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> DrivingStatistics:
-    """Return the statistics of some behaviour in S scenes, with errors after 5 s where these are known."""
+def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Tallies:
+    """Return the tallies of some behaviour in S scenes, with errors after 5 s where these are known."""
     known = behaviour.known
 
     def by_scene(scene: Tensor, values: Tensor) -> FloatArray:
@@ -234,30 +225,25 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
     def steps(values: Tensor) -> FloatArray:
         return by_scene(behaviour.scene, (values.double() * known).sum(dim=0))
 
-    counts = {}
+    tallies = {
+        "steps": steps(known),
+        "hard_brake": steps(behaviour.acceleration <= HARD_BRAKE_ACCELERATION),
+        "collision": steps(behaviour.contact),
+        "off_road": steps(behaviour.off_road),
+        "lane_changes": steps(behaviour.changed),
+        "speed": steps(behaviour.speed),
+        "vehicles": by_scene(behaviour.scene, known.any(dim=0)),
+        "ever": by_scene(behaviour.scene, (behaviour.contact & known).any(dim=0)),
+    }
     for name, (values, scene) in binned_quantities(behaviour).items():
         low, high, bins = BINS[name]
         place = ((values.double() - low) / (high - low) * bins).floor().clamp(0, bins - 1).long()
         flat = np.bincount((scene * bins + place).numpy(), minlength=scenes * bins)
-        counts[name] = flat.reshape(scenes, bins).astype(np.float64)
-    squared = {}
+        tallies[f"bins {name}"] = flat.reshape(scenes, bins).astype(np.float64)
     if errors is not None:
-        squared = {name: by_scene(errors["scene"], errors[name].square()) for name in ERROR_NAMES}
-        squared["number"] = by_scene(errors["scene"], torch.ones_like(errors["position"]))
-    return DrivingStatistics(
-        steps=steps(known),
-        vehicles=by_scene(behaviour.scene, known.any(dim=0)),
-        sums={
-            "hard_brake": steps(behaviour.acceleration <= HARD_BRAKE_ACCELERATION),
-            "collision": steps(behaviour.contact),
-            "off_road": steps(behaviour.off_road),
-            "lane_changes": steps(behaviour.changed),
-            "speed": steps(behaviour.speed),
-            "ever": by_scene(behaviour.scene, (behaviour.contact & known).any(dim=0)),
-        },
-        counts=counts,
-        squared=squared,
-    )
+        tallies |= {f"error {name}": by_scene(errors["scene"], errors[name].square()) for name in ERROR_NAMES}
+        tallies["errors"] = by_scene(errors["scene"], torch.ones_like(errors["position"]))
+    return tallies
 
 
 @dataclass(frozen=True)
@@ -295,38 +281,32 @@ def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
     return float(0.5 * rel_entr(p, middle).sum() + 0.5 * rel_entr(q, middle).sum())
 
 
-def summarise_realism(
-    driven: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
-) -> Realism:
+def summarise_realism(driven: Tallies, recorded: Tallies, times: FloatArray | None = None) -> Realism:
     """Return rates, divergences from a record, and errors of a driver; scenes count so many times (S,), or once."""
-    times = np.ones_like(driven.steps) if times is None else times
-    steps, vehicles = times @ driven.steps, times @ driven.vehicles
+    times = np.ones_like(driven["steps"]) if times is None else times
+    sums = {name: times @ values for name, values in driven.items()}
+    per_step = {name: float(sums[name] / sums["steps"]) for name in (*SHARES, "lane_changes", "speed")}
 
-    def share(counts: FloatArray, of: FloatArray) -> FloatArray:
-        total = of @ counts
-        return np.asarray(total / max(total.sum(), 1.0))
+    def divergence(name: str) -> float:
+        counts = sums[f"bins {name}"], recorded[f"bins {name}"].sum(axis=0)
+        return jensen_shannon(*(each / max(each.sum(), 1.0) for each in counts))
 
-    ones = np.ones_like(recorded.steps)
-    rmse = {}
-    if driven.squared and (number := times @ driven.squared["number"]) > 0:
-        rmse = {name: float(np.sqrt(times @ driven.squared[name] / number)) for name in ERROR_NAMES}
+    measured = ERROR_NAMES if sums.get("errors", 0.0) > 0 else ()
     return Realism(
-        vehicles=int(vehicles),
-        **{name: float(times @ driven.sums[name] / steps) for name in SHARES},
-        ever=float(times @ driven.sums["ever"] / vehicles),
-        lane_changes=float(times @ driven.sums["lane_changes"] / steps * 10.0 / DT),
-        mean_speed=float(times @ driven.sums["speed"] / steps),
-        divergence={
-            name: jensen_shannon(share(driven.counts[name], times), share(recorded.counts[name], ones)) for name in BINS
-        },
-        rmse=rmse,
+        vehicles=int(sums["vehicles"]),
+        **{name: per_step[name] for name in SHARES},
+        ever=float(sums["ever"] / sums["vehicles"]),
+        lane_changes=per_step["lane_changes"] * 10.0 / DT,
+        mean_speed=per_step["speed"],
+        divergence={name: divergence(name) for name in BINS},
+        rmse={name: float(np.sqrt(sums[f"error {name}"] / sums["errors"])) for name in measured},
     )
 
 
 def collect_statistics(
     recording: Recording, act: Act, seconds: tuple[float, ...], starts: tuple[Tensor, Tensor] | None = None
-) -> dict[float, DrivingStatistics]:
-    """Drive recorded scenes by one driver and return the statistics up to each of some times [s], the longest last.
+) -> dict[float, Tallies]:
+    """Drive recorded scenes by one driver and return the tallies up to each of some times [s], the longest last.
 
     Starts are scenes and ticks, (B,) each; None for every 2 s of every scene.
     """
@@ -360,8 +340,8 @@ def measure(
     return summarise_realism(driven, record_statistics(recording))
 
 
-def record_statistics(recording: Recording) -> DrivingStatistics:
-    """Return the statistics of people in the recorded scenes."""
+def record_statistics(recording: Recording) -> Tallies:
+    """Return the tallies of people in the recorded scenes."""
     return sum_by_scene(recorded_behaviour(recording), len(recording.x))
 
 

@@ -28,6 +28,19 @@ USE = (
     "rule), know nothing of other roads, weather, photographs, people on foot or traffic lights, and must not drive a "
     "car."
 )
+TRAFFIC = {
+    "imitation": "The ego `imitation` was trained in these scenes, in draws of `CutIn-v0`, of `CarFollowing-v0` and of "
+    "a `HardBrake-v0` whose lead braked at a constant rate, and in ordinary traffic, and corrected on failures in "
+    "`CutIn-v0` and in the same script with a drawn duration; none of its cutters looked. `training/egos` of 8dec38c6 "
+    "has the code of its commands.",
+    "vision": "The ego `vision` was trained among scripted cutters, leads that swing, leads that brake at a constant "
+    "rate, and in ordinary traffic, on roads and in weather that were drawn, and corrected on failures behind the "
+    "third. `training/egos` of 8dec38c6 has the code of its commands.",
+}
+MEASURED = (
+    "Both were measured in ordinary traffic (below), and in every scenario as it stands: p of a collision is in "
+    "[docs/results.md](../../docs/results.md#egos)."
+)
 HEAD = (
     "Written by `python -m training.recipes.model_card` from the headers of the files. Load one with "
     '`agents.load_driver("NAME")`, an ego with `agents.load_ego("NAME")`.'
@@ -46,10 +59,12 @@ def format_model_card(folder: Path) -> str:
     data = [
         f"{each.data.rstrip('.')}. Licence of the data and files: {each.data_licence}." for each in origins.values()
     ]
+    egos = [TRAFFIC[name] for name in origins if name in TRAFFIC]
     commands = "\n".join(f"- {name}: `{origin.command}`" for name, origin in origins.items())
     parts = [
         *("# Learned drivers", HEAD, _table("", facts), USE),
         *("## Data and licence", *dict.fromkeys(data), ATTRIBUTION),
+        *(("## Traffic of the egos", *egos, MEASURED) if egos else ()),
         *(
             "## Training",
             "By commands of the version of that time; those of today are in `training/recipes`.",

@@ -8,29 +8,21 @@ into nobody and never follows its lead closer than 0.5 s or 1 m; after a lead cu
 It must also advance: an ego that covers less than half of the distance of its lead (or, without a lead, of that at its
 first speed) is left behind. If another vehicle runs into it from behind or from the side, the rollout counts neither
 way.
-
-An ego that fails is corrected: searches find failures, half of which are held out, and it learns labels of the others
-by DAgger (Ross, Gordon and Bagnell, AISTATS 2011): the ego drives, an expert that sees the true state says what was
-right, and the network learns that.
 """
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
-import rare_envs
-import samplers
 from agents import load_driver
 from agents.learned.driver import RuleDriver
 from agents.learned.networks import HUMAN_NOISE
@@ -281,69 +273,3 @@ def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, A
         least = clopper_pearson(passed, judged, 0.95)[0] if judged else 0.0
         found[case] = {"passed": passed, "judged": judged, "at least": least, **counts}
     return found
-
-
-class Search(NamedTuple):
-    """A search for failures of an ego: its record, those to learn from (n, d), and the others."""
-
-    record: dict[str, Any]
-    driven: FloatArray
-    held_out: FloatArray
-
-
-def correct(
-    ego: Callable[[], Any],
-    searched: Sequence[tuple[str, str]],
-    rounds: int,
-    seed: int,
-    rng: np.random.Generator,
-    learn_from: Callable[[list[Search]], None],
-    most: int | None = None,
-    **options: Any,
-) -> list[dict[str, Any]]:
-    """Search failures in scenarios and bases, and let an ego learn from half of them, some rounds long.
-
-    Returns for each search its p, the failures found, and how many of the `most` that are driven, and of as many
-    others, the corrected ego still fails in. The options are those of `samplers.estimate`.
-    """
-    searches = []
-    for number in range(rounds):
-        found = []
-        for k, (env_id, base) in enumerate(searched):
-            problem = rare_envs.DrivingProblem(env_id, ego=ego(), base=base)
-            each = samplers.estimate(problem, samplers.TwoStage(), seed=1000 * seed + 10 * number + k, **options)
-            x = rng.permutation(np.asarray(each.failures.x))
-            record = {"env_id": env_id, "base": base, "p": each.p, "found": len(x)}
-            found.append(Search(record, x[::2][:most], x[1::2][:most]))
-            typer.echo(f"round {number}: {found[-1].record}", err=True)
-        learn_from(found)
-        searches += found
-    return [count_failing(search, ego()) for search in searches]
-
-
-def count_failing(search: Search, ego: Any) -> dict[str, Any]:
-    """Return the record of a search, with how many of its failures a corrected ego still fails in."""
-    problem, record = rare_envs.DrivingProblem(search.record["env_id"], ego=ego), dict(search.record)
-    for name, x in (("driven", search.driven), ("held_out", search.held_out)):
-        record |= {name: len(x), f"{name}_failing": int((problem.evaluate(x) <= 0.0).sum()) if len(x) else 0}
-    return record
-
-
-def learn(
-    parameters: list[torch.nn.Parameter], loss: Callable[[], Tensor], steps: int, rate: float, clip: float = math.inf
-) -> None:
-    """Make steps of Adam down a loss of drawn moments, at a rate that falls to zero as a cosine."""
-    optimiser = torch.optim.Adam(parameters, rate)
-    for step in range(steps):
-        descend(optimiser, loss(), rate * (0.5 + 0.5 * math.cos(math.pi * step / steps)), clip)
-
-
-def descend(optimiser: torch.optim.Optimizer, loss: Tensor, rate: float, clip: float = math.inf) -> None:
-    """Make one step down a loss at a rate, with a gradient of at most some norm."""
-    for group in optimiser.param_groups:
-        group["lr"] = rate
-    optimiser.zero_grad()
-    torch.autograd.backward(loss)
-    if clip < math.inf:
-        torch.nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
-    optimiser.step()

@@ -1,28 +1,25 @@
-"""The ego `vision`: imitation of a driver by rule, with corrections where the network itself drives.
+"""The ego `vision`: imitation of a driver by rule, where that and where the network itself drives.
 
     python -m training.recipes.vision --out runs/vision
 
 Round 0 imitates the expert in its own drives. In each later round the network drives, mixed with the expert less and
-less, the expert labels the pictures, and the network learns from those of all rounds (DAgger). Then it is corrected
-(`ordinary_traffic.learn`): it drives failures in hard brakes, draws of the scenarios and situations of before,
-and learns labels that ask for harder braking than the vehicle's, so that an error of regression about them still brakes
-fully. At test time there is the network alone, which sees pictures and its own speed. The shipped file is one of
-`--seed 0`, corrected in two rounds of seed 0 and one of seed 1.
+less, the expert labels the pictures, and the network learns from those of all rounds (DAgger; Ross, Gordon and Bagnell,
+AISTATS 2011). At test time there is the network alone, which sees pictures and its own speed. The shipped file is that
+of `--seed 0`, corrected in three rounds on failures behind leads that braked at a constant rate: its header names the
+code.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 import typer
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from agents import Provenance
@@ -31,7 +28,6 @@ from agents.vision import (
     ACCELERATION_UNIT,
     LAG,
     MIN_STEERING_SPEED,
-    OBSERVATION,
     PILOTNET_HIDDEN_UNITS,
     TURN_UNIT,
     PilotNet,
@@ -43,33 +39,18 @@ from agents.vision import (
 )
 from rare_envs.control.actions import MAX_STEERING, to_physical
 from rare_envs.control.idm import IDM
-from rare_envs.files import replace_text
-from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Weather
 from rare_envs.sensors.pictures import take_picture
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Clock, Sensing, World
+from rare_envs.simulation.world import World
 from rare_envs.startup import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.command_line import RunFolderOption, run_command
-from training.recipes.ordinary_traffic import Search, correct, descend, judge_all_cases, learn
+from training.recipes.ordinary_traffic import judge_all_cases
 from training.recipes.situations import make_situations, start_situation
 
 VISION_EXPERT = IDM(jam_distance=2.0)
 """Treiber, Hennecke and Helbing's (2000) distance at standstill: 1 m, the suite's, leaves nothing to an imitator."""
-DEMANDED_BRAKING = 10.0
-"""Hardest braking that the labels of the corrections ask for [m/s^2]; the vehicle's is 5."""
-SEARCHED = ("rare_envs/HardBrake-v0", "us101")
-DRAWN = (
-    SEARCHED,
-    ("rare_envs/CutIn-v0", "us101"),
-    ("rare_envs/CutIn-v1", "us101"),
-    ("rare_envs/CarFollowing-v0", "us101-gap"),
-)
-"""Scenarios and bases in which failures are searched, and that are driven by draws."""
-FIRST_TICKS, CAMERA_ROWS = 10, 64
-"""Ticks at the start that are all recorded, because a short gap is braked for then or never; rows driven at once."""
 MAX_GRADIENT_NORM = 5.0
 """Norm to which gradients are clipped."""
 JUDGE_SEED = 2026
@@ -98,33 +79,12 @@ class VisionPlan:
     truth_weight: float = 0.5
 
 
-@dataclass(frozen=True)
-class CorrectionPlan:
-    """Amounts of the corrections: simulations of a search, most failures driven, draws of each scenario in a round.
-
-    Of the first training's situations the expert drives some before the first round, and the network some in each;
-    drives take so many seconds.
-    """
-
-    seed: int = 0
-    rounds: int = 3
-    simulations: int = 600
-    driven: int = 192
-    draws: int = 64
-    drives: tuple[int, int] = (28, 14)
-    rows: int = 24
-    seconds: float = 10.0
-    visits: int = 30_000
-    batch: int = 32
-    rate: float = 3e-4
-
-
-def expert_outputs(episode: Episode, brakes: float = VISION_EXPERT.max_deceleration) -> Tensor:
+def expert_outputs(episode: Episode) -> Tensor:
     """Return the outputs that the network should give, in units of `ACCELERATION_UNIT` and `TURN_UNIT`, shape (B, 2).
 
-    Acceleration is IDM's behind the lead, with braking of up to `brakes` [m/s^2]. The yaw rate is that of
-    `rare_envs.control.idm` with the road's curvature fed forward, so that it does not run wide, and with a sine of
-    the heading towards the lane of at most 0.3. Below `MIN_STEERING_SPEED` it uses that speed for the curvature.
+    Acceleration is IDM's behind the lead. The yaw rate is that of `rare_envs.control.idm` with the road's curvature fed
+    forward, so that it does not run wide, and with a sine of the heading towards the lane of at most 0.3. Below
+    `MIN_STEERING_SPEED` it uses that speed for the curvature.
     """
     state, road = episode.state, episode.road
     speed, heading = state.speed[:, 0].clamp(min=MIN_STEERING_SPEED), state.heading[:, 0]
@@ -133,7 +93,7 @@ def expert_outputs(episode: Episode, brakes: float = VISION_EXPERT.max_decelerat
     turn = (wanted - heading) / HEADING_TIME + speed * road.curvature(state.x[:, 0])
     slip = torch.atan(0.5 * torch.tan(torch.tensor(MAX_STEERING)))  # of the bicycle model at full steering
     limit = speed * torch.sin(slip) / (0.5 * VEHICLE_LENGTH)
-    acceleration = replace(VISION_EXPERT, max_deceleration=brakes).acceleration(state.speed[:, 0], episode.lead)
+    acceleration = VISION_EXPERT.acceleration(state.speed[:, 0], episode.lead)
     turn = torch.maximum(torch.minimum(turn, limit), -limit)
     return torch.stack((acceleration / ACCELERATION_UNIT, turn / TURN_UNIT), dim=1)
 
@@ -186,19 +146,17 @@ def drive_and_label(
     *,
     recorded_share: float,
     noise: float = 0.0,
-    brakes: float = VISION_EXPERT.max_deceleration,
-    first_ticks: int = 0,
 ) -> Iterator[LabelledPictures]:
     """Drive on from a moment, and yield pictures with the outputs of the expert, until egos collide.
 
     The network decides at a share of the ticks, the expert at the others; with None the expert drives alone. A share of
-    the ticks is recorded, the first ones all. Actions have a factor of a noise of 0.5 m/s^2 and 0.05 rad/s for about
-    half a second, so that places off the expert's path are seen. Labels ask for braking of up to `brakes` [m/s^2].
+    the ticks is recorded. Actions have a factor of a noise of 0.5 m/s^2 and 0.05 rad/s for about
+    half a second, so that places off the expert's path are seen.
     """
     state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
-    for tick in range(ticks):
-        speed, expert = episode.state.speed[:, 0], expert_outputs(episode, brakes)
-        recorded = ~episode.collided & (bool(rng.random() < recorded_share) | (tick < first_ticks))
+    for _ in range(ticks):
+        speed, expert = episode.state.speed[:, 0], expert_outputs(episode)
+        recorded = ~episode.collided & bool(rng.random() < recorded_share)
         swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
         output = expert + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
         if network is None:  # the expert needs no pictures: only recorded ones are taken
@@ -262,48 +220,15 @@ def train_vision(plan: VisionPlan) -> PilotNet:
             error = nn.functional.smooth_l1_loss(network.out(hidden), some.expert, beta=0.5)
             truth = nn.functional.smooth_l1_loss(probe(hidden), some.truth)
             rate = plan.rate * (0.505 + 0.495 * math.cos(math.pi * visited / all_visits))
-            descend(optimiser, error + plan.truth_weight * truth, rate, MAX_GRADIENT_NORM)
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            optimiser.zero_grad()
+            torch.autograd.backward(error + plan.truth_weight * truth)
+            nn.utils.clip_grad_norm_((*network.parameters(), *probe.parameters()), MAX_GRADIENT_NORM)
+            optimiser.step()
             left, visited = left - len(some.speed), visited + len(some.speed)
         typer.echo(f"round {number}: {len(data.speed):,} pictures, loss {error.item():.4f}", err=True)
     return network.eval().requires_grad_(False)
-
-
-def correct_vision(network: PilotNet, plan: CorrectionPlan) -> list[dict[str, Any]]:
-    """Correct a network in place; return a record of each round, see `correct`."""
-    rng, ticks = np.random.default_rng(plan.seed), round(plan.seconds / VisionEgo.dt)
-
-    def situations(by: PilotNet | None, drives: int, share: float, noise: float) -> Iterator[LabelledPictures]:
-        how = {"recorded_share": share, "noise": noise, "brakes": DEMANDED_BRAKING}
-        return drive_situations(by, 1.0, drives, plan.rows, ticks, rng, **how)
-
-    def scenarios(env_id: str, x: NDArray[np.float64], share: float) -> Iterator[LabelledPictures]:
-        world = World(find_scenario(env_id), Sensing(OBSERVATION), clock=Clock(horizon=plan.seconds))
-        how: dict[str, Any] = {"recorded_share": share, "brakes": DEMANDED_BRAKING, "first_ticks": FIRST_TICKS}
-        for rows in torch.split(torch.from_numpy(x).float(), CAMERA_ROWS) if len(x) else ():
-            yield from drive_and_label(world, world.start(rows), network, 1.0, ticks, rng, **how)
-
-    data = list(situations(None, plan.drives[0], 0.06, 1.0))
-
-    def learn_from(searches: list[Search]) -> None:
-        for search in searches:
-            data.extend(scenarios(search.record["env_id"], search.driven, 0.3))
-        data.extend(situations(network, plan.drives[1], 0.15, 0.0))
-        for env_id, base in DRAWN:
-            drawn = np.asarray(load_base(find_scenario(env_id), base).sample(plan.draws, rng))
-            data.extend(scenarios(env_id, drawn, 0.15))
-        pictures = concatenate(data)
-
-        def loss() -> Tensor:
-            some = draw_batch(pictures, plan.batch, rng)
-            given = network(some.picture, some.earlier, some.speed)
-            return nn.functional.smooth_l1_loss(given, some.expert, beta=0.5)
-
-        network.train().requires_grad_(True)
-        learn(list(network.parameters()), loss, math.ceil(plan.visits / plan.batch), plan.rate, MAX_GRADIENT_NORM)
-        network.eval().requires_grad_(False)
-
-    options: dict[str, Any] = {"most": plan.driven, "max_sim": plan.simulations, "ensemble_run": False}
-    return correct(lambda: VisionEgo(network), (SEARCHED,), plan.rounds, plan.seed, rng, learn_from, **options)
 
 
 @use_one_thread()
@@ -312,13 +237,11 @@ def main(
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,
     judged: Annotated[int, typer.Option(help="Minutes of driving in each kind of ordinary traffic to judge it.")] = 30,
 ) -> None:
-    """Train and correct the ego `vision`; write it to OUT/vision.safetensors, with the counts in OUT/rounds.json."""
+    """Train the ego `vision`; write it to OUT/vision.safetensors."""
     out.mkdir(parents=True, exist_ok=True)
     network = train_vision(VisionPlan(seed=seed))
-    records = correct_vision(network, CorrectionPlan(seed=seed))
-    replace_text(out / "rounds.json", json.dumps(records, indent=1) + "\n")
     provenance = Provenance(
-        kind="imitation of a driver by rule with on-policy corrections (DAgger), corrected",
+        kind="imitation of a driver by rule with on-policy corrections (DAgger)",
         command=f"python -m training.recipes.vision --seed {seed} --judged {judged}",
         data="Pictures of this project's own simulations; nothing was recorded on a road.",
         data_licence="that of the project",

@@ -1,10 +1,9 @@
-"""Recipes of the egos: the judge of ordinary traffic, the labels of the corrections, and that the trainings run."""
+"""Recipes of the egos: the judge of ordinary traffic, encounters, pictures with labels, and that the trainings run."""
 
 from __future__ import annotations
 
-import copy
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,24 +12,17 @@ import torch
 
 import agents
 import rare_envs
-from agents import LearnedDriver
 from agents.vision import to_actions
 from rare_envs.control.actions import to_physical
 from rare_envs.control.idm import IDM
-from rare_envs.scenarios.registry import find_scenario
-from rare_envs.simulation.world import Sensing, World
-from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from tests.training.imitation.synthetic_scenes import scene
 from training.imitation.config import Config
 from training.imitation.traffic import stack_scenes, start_replay, step_replay
 from training.imitation.train import train_learner
 from training.recipes import imitation, vision
-from training.recipes.imitation import EXPERT, FREE, EncounterSpec, expert_acceleration, make_scenes, record_drive
+from training.recipes.imitation import EncounterSpec, make_scenes
 from training.recipes.ordinary_traffic import FLOOR_HEADWAY, VERDICT_NAMES, judge
 from training.recipes.situations import make_situations, start_situation
-
-CUT_IN = World(find_scenario("rare_envs/CutIn-v0"), Sensing("features", lidar=True))
-CUT_INS = np.array([[25.0, 12.0, 20.0, 15.0, 40.0, 3.5], [20.0, 20.0, 20.0, 60.0, 60.0, 3.5]])
 
 
 @dataclass(frozen=True)
@@ -103,65 +95,6 @@ def test_the_training_among_encounters_repeats_and_learns_from_people_only() -> 
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def traffic(gap: float, aside: float, heading: float = 0.0) -> State:
-    x, y = torch.tensor([[0.0, gap + VEHICLE_LENGTH]]), torch.tensor([[0.0, aside]])
-    return State(x, y, torch.tensor([[0.0, heading]]), torch.tensor([[20.0, 15.0]]), theta=x[:, :0])
-
-
-def test_the_expert_brakes_as_idm_for_those_in_its_path_and_coming_into_it() -> None:
-    root = 2.0 * np.sqrt(EXPERT.max_acceleration * EXPERT.comfortable_deceleration)
-    desired_gap = EXPERT.jam_distance + 20.0 * EXPERT.time_headway + 20.0 * 5.0 / root
-    expected = EXPERT.max_acceleration * (1.0 - (20.0 / 40.0) ** 4 - (desired_gap / 15.0) ** 2)
-    assert expert_acceleration(traffic(15.0, 0.0)).item() == pytest.approx(expected, rel=1e-5)
-    for state, brakes in (
-        (traffic(10.0, 3.5), False),  # beside
-        (traffic(10.0, 2.4), True),  # within the margin
-        (traffic(10.0, 3.5, heading=-0.08), True),  # comes 1.2 m nearer within 1 s
-        (traffic(10.0, 2.6, heading=-0.01), False),  # sways
-        (traffic(10.0, 3.5, heading=0.08), False),  # goes away
-        (traffic(10.0, 3.0, heading=-0.5), True),  # will be on the other side by then
-        (traffic(-12.0, 0.0), False),  # behind
-        (traffic(-2.0, 2.1), True),  # overlaps along the road and across it nearly
-    ):
-        wanted = expert_acceleration(state).item()
-        assert (wanted < -1.0) if brakes else (wanted == FREE)
-
-
-@pytest.fixture
-def coasting() -> LearnedDriver:
-    """An ego that hardly accelerates, brakes or steers, whatever it sees."""
-    ego = agents.load_driver("imitation")
-    assert isinstance(ego, LearnedDriver)
-    policy = copy.deepcopy(ego.policy)
-    for weights in policy.head.parameters():
-        weights.data.zero_()
-    return replace(ego, policy=policy)
-
-
-def test_labels_are_the_teachers_but_for_harder_braking(coasting: LearnedDriver) -> None:
-    plain, right = (record_drive(coasting, coasting.policy, CUT_IN, CUT_INS, 10, corrected=c) for c in (False, True))
-    assert torch.equal(plain[0], right[0])
-    assert torch.equal(plain[1][:, :2], torch.zeros_like(plain[1][:, :2]))
-    assert torch.equal(right[1][:, 1:], plain[1][:, 1:])
-    assert (right[1][:, 0] <= 0.0).all() and (right[1][:, 0] == 0.0).sum() > 5
-    hardest = EXPERT.max_deceleration / coasting.policy.scaling.action_std[0].item()
-    assert right[1][:, 0].min().item() == pytest.approx(-hardest, rel=0.05)
-
-
-@pytest.mark.slow
-def test_corrections_change_a_copy_and_hold_half_of_the_failures_out(
-    coasting: LearnedDriver, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(imitation, "CASES", {})
-    plan = imitation.Corrections(draws=4, simulations=600, steps=60, batch=64, recorded=30)
-    before = coasting.policy.head.weight.clone()
-    corrected, records = imitation.correct_ego(coasting, plan, torch.rand(50, 51) * 20.0)
-    assert torch.equal(coasting.policy.head.weight, before)
-    assert not torch.equal(corrected.policy.head.weight, before)
-    for record in records:
-        assert record["found"] == record["driven"] + record["held_out"] > 0 and 0.0 < record["p"] < 1.0
-
-
 def test_it_brakes_for_those_who_cut_in() -> None:
     """The driver of the traffic, which never met encounters, collides in one of seven."""
     collided = {}
@@ -211,16 +144,9 @@ def test_pictures_carry_the_outputs_of_the_expert_mirrored_with_the_picture() ->
 
 
 @pytest.mark.slow
-def test_a_tiny_training_of_vision_runs_and_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tiny_training_of_vision_runs_and_repeats() -> None:
     plan = vision.VisionPlan(
         rounds=1, drives=(7, 4), rows=2, ticks=(6, 6), recorded=(0.5, 0.5), visits=(40, 30), batch=8
     )
     network, other = vision.train_vision(plan), vision.train_vision(plan)
     assert all(torch.equal(a, b) for a, b in zip(network.parameters(), other.parameters(), strict=True))
-    monkeypatch.setattr(vision, "DRAWN", ())
-    small = vision.CorrectionPlan(
-        rounds=1, simulations=60, driven=2, drives=(1, 1), rows=2, seconds=0.5, visits=8, batch=4
-    )
-    (record,) = vision.correct_vision(network, small)
-    assert record["driven_failing"] <= record["driven"] <= 2
-    assert not all(torch.equal(a, b) for a, b in zip(network.parameters(), other.parameters(), strict=True))
