@@ -37,7 +37,7 @@ def sb3_vec_env(
         discrete: Offer the rows of `rare_envs.control.actions.DISCRETE_ACTIONS` as a `Discrete` action
             space, for algorithms such as DQN; an environment with `action="meta"` has one already.
         even_strata: Draw the strata of a base distribution equally often, whatever their shares, so that a policy
-            meets the rare ones: of the cutters of CutIn-v1 one in 7,000 does not look.
+            meets the rare ones: of the cutters of CutIn-v1 one in 6,000 does not look.
         **make_kwargs: Keyword arguments of `gym.make` for these environments.
 
     Returns:

@@ -60,7 +60,7 @@ def train_ego_command(
         Option(
             "--even-strata/--shares",
             help="Draw the kinds of an event equally often, or as often as they happen: of the cutters of CutIn-v1 "
-            "one in 7,000 does not look.",
+            "one in 6,000 does not look.",
         ),
     ] = True,
 ) -> Answer:
