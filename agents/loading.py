@@ -230,7 +230,10 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
         lambda spec: spec.endswith(".zip") or Path(spec).is_file(),
         lambda text, *how: load_saved_ego(Path(text), *how),
     ),
-    "function": (lambda spec: ":" in spec and "/" not in spec, _call_factory),
+    "function": (
+        lambda spec: ":" in spec and "/" not in spec and spec.partition(":")[0] not in RULE_BASED_EGOS,
+        _call_factory,
+    ),
 }
 """Kinds of ego, the first that holds of a name counts: whether it does, and how the ego is loaded."""
 

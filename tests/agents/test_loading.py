@@ -45,6 +45,7 @@ UNKNOWN = {
     "idn": r"Unknown ego 'idn' \(did you mean 'idm'\?\); expected 'idm', 'human', .*'imitation', 'vision',",
     "": "Unknown ego ''; expected",
     "IDM": r"Unknown ego 'IDM' \(did you mean 'idm'\?\)",
+    "human:no-headway": r"Unknown ego 'human:no-headway' \(did you mean 'human:no-headway-rule'\?\)",
     "runs/ego": r"Unknown ego 'runs/ego' \(there is no such file\)",
     "ego.pt": r"Unknown ego 'ego\.pt' \(there is no such file\)",
     "noisy:": "Expected an ego behind 'noisy:', such as noisy:model.zip, got 'noisy:'",

@@ -6,14 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecNormalize
 
-import agents
 import rare_envs
 import samplers
-import training
 from rare_envs.devices import POLICY_TILE
 from rare_envs.scenarios.registry import SCENARIOS
 
@@ -51,32 +46,6 @@ def test_policies_are_asked_in_fixed_tiles() -> None:
     assert ego.batches == [POLICY_TILE, 10]
 
 
-def test_recurrent_egos_get_their_state_back() -> None:
-    seen: list[tuple[Any, bool]] = []
-
-    class Recurrent(Constant):
-        def predict(self, observation, state=None, episode_start=None, deterministic=False):
-            seen.append((state, bool(episode_start.all())))
-            return super().predict(observation, None, episode_start, deterministic)[0], (len(seen),)
-
-    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Recurrent([0.0, 0.0]), horizon=0.3)
-    problem.evaluate(np.array([[20.0, 20.0, 30.0]]))
-    assert seen == [(None, True), ((1,), False), ((2,), False)]
-
-
-@pytest.mark.parametrize(
-    ("ego", "message"),
-    [
-        (Constant([0.0, 0.0], observation_space=spaces.Box(-1, 1, (25,))), r"observations.*25.*11"),
-        (Constant(0, action_space=spaces.Discrete(3)), r"Discrete\(3\).*Discrete\(5\)"),
-        (Constant([0.0], action_space=spaces.Box(-1, 1, (1,))), "acceleration, steering"),
-    ],
-)
-def test_wrong_egos_are_refused_before_any_simulation(ego: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego)
-
-
 def test_wrong_x_is_refused() -> None:
     problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")
     with pytest.raises(ValueError, match="shape"):
@@ -110,24 +79,6 @@ def test_what_comes_after_a_collision_is_not_shown_to_the_policy() -> None:
             done = terminated or truncated
         assert info["measure"] == f[row]
     assert f[0] == -1.0 < f[1]
-
-
-def test_a_model_trained_behind_vec_normalize_gets_its_statistics(tmp_path: Any) -> None:
-    env = VecNormalize(training.sb3_vec_env("rare_envs/CutIn-v0", 16))
-    model = PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1, seed=0).learn(1_000)
-    model.save(tmp_path / "ego.zip")
-    env.save(str(tmp_path / "ego_vecnormalize.pkl"))
-    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=model)
-    x = problem.base.sample(50, np.random.default_rng(0))
-    saved = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego(str(tmp_path / "ego.zip")))
-    np.testing.assert_array_equal(problem.evaluate(x), saved.evaluate(x))
-    observed = Constant([0.0, 0.0], get_vec_normalize_env=lambda: env)
-    seen: list[Any] = []
-    observed.predict = lambda observation, **_: (seen.append(observation), (np.zeros((len(observation), 2)), None))[1]  # type: ignore[method-assign]
-    normalising = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=observed, horizon=0.1)
-    plain = gym.make("rare_envs/CutIn-v0").reset(options={"x": x[0]})[0]
-    normalising.evaluate(x[:1])
-    np.testing.assert_allclose(seen[0][0], env.normalize_obs(plain), rtol=1e-6)
 
 
 def test_p_is_conditional_on_fixed_noise_and_says_so() -> None:
