@@ -31,8 +31,6 @@ MAX_COVERING_REFITS = 30
 """Refits whose mixture reaches where failures under any of them lie: of 100, more take longer and reach no further."""
 PART_KEYS = ("share", "accepted")
 """Keys of a stratum that a refit has of its own."""
-COORDINATE_KEYS = ("coordinates", "order")
-"""Keys of a file that a refit may have of its own, where it has chosen other coordinates than its base."""
 
 
 def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
@@ -316,41 +314,28 @@ def _join_sibling(distributions: Sequence[Distribution], fitted: FittedDistribut
 def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribution:
     """Return a refit, whose entries replace those of the base, or stratum by stratum those of its strata."""
     if "strata" not in data:
-        return cast(FileDistribution, _read_with(f"refits[{i}]", refit, data, read_distribution))
-    parts, own = data["strata"], refit.get("strata") if isinstance(refit, Mapping) else None
-    if not isinstance(own, list | tuple) or len(own) != len(parts):
-        raise ValueError(f"Expected refits[{i}] with strata, one for each of its base, got {refit!r}.")
-    inherited = {"names": data.get("names")}
-    strata = [
-        Stratum(
-            part["name"],
-            each.get("share", part["share"]),
-            _read_with(f"refits[{i}], {part['name']}", each, {**inherited, **part}, read_part),
-        )
-        for each, part in zip(own, parts, strict=True)
-    ]
-    return StratifiedDistribution(tuple(strata), data["limits"], data["column"], data.get("less"))
+        merged = _merge(f"refits[{i}]", refit, data)
+    else:
+        parts, own = data["strata"], refit.get("strata") if isinstance(refit, Mapping) else None
+        if not isinstance(own, list | tuple) or len(own) != len(parts):
+            raise ValueError(f"Expected refits[{i}] with strata, one for each of its base, got {refit!r}.")
+        strata = [_merge(f"refits[{i}], {part['name']}", each, part) for each, part in zip(own, parts, strict=True)]
+        merged = {**data, "strata": strata}
+    try:
+        return read_distribution(merged)
+    except ValueError as error:
+        raise ValueError(f"refits[{i}]: {error}") from None
 
 
-def _read_with(what: str, refit: object, data: Mapping[str, Any], read: Callable[[Mapping[str, Any]], Any]) -> Any:
-    """Return a refit or a stratum of one, with the entries of the base for what it does not have (`what` in messages).
-
-    A share and the deceleration accepted are its own, where the base has them.
-    """
-    wanted, own = (BETA_SHAPES, ()) if "alpha" in data else (COMPONENT_FIELDS, (*COORDINATE_KEYS, *PART_KEYS))
+def _merge(what: str, refit: object, base: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a refit, or of a stratum of one, with those of the base for what it does not have."""
+    wanted = BETA_SHAPES if "alpha" in base else COMPONENT_FIELDS
     if not isinstance(refit, Mapping):
         raise ValueError(f"Expected {what} as an object with {', '.join(wanted)}, got {refit!r}.")
-    missing = [name for name in wanted if name not in refit]
-    others = [str(name) for name in refit if name not in (*wanted, *own) and refit[name] != data.get(name)]
-    if missing or others:
-        wrong = f"no {', '.join(missing)}" if missing else f"{', '.join(others)} of its own"
-        raise ValueError(f"Expected {what} with {', '.join(wanted)}, for the rest as its base, got {wrong}.")
+    if missing := [name for name in wanted if name not in refit]:
+        raise ValueError(f"Expected {what} with {', '.join(wanted)}, got no {', '.join(missing)}.")
     # Coordinates of its own come with an order of their own, or that of x.
-    inherited = {k: v for k, v in data.items() if "coordinates" not in refit or k != "order"}
-    try:
-        return read({**inherited, **refit})
-    except ValueError as error:
-        raise ValueError(f"{what}: {error}") from None
+    return {**{k: v for k, v in base.items() if "coordinates" not in refit or k != "order"}, **refit}
 
 
 def _to_dict(distribution: Distribution) -> dict[str, Any]:
@@ -361,22 +346,19 @@ def _to_dict(distribution: Distribution) -> dict[str, Any]:
 
 
 def _refit_entries(i: int, refit: Distribution, base: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a refit that are its own."""
+    """Return the entries of a refit that are its own, or those of each of its strata."""
     entries = _to_dict(refit)
     if {"alpha", "strata"} & {*entries} != {"alpha", "strata"} & {*base}:
-        raise ValueError(f"refits[{i}] has another box than its base, or is of another kind; a file holds one for all.")
+        raise ValueError(f"refits[{i}] is of another kind than its base; a file holds one for all.")
     if "strata" in base:
-        pairs = zip(entries["strata"], base["strata"], strict=True)
-        return {"strata": [_own_entries(i, own, part) for own, part in pairs]}
-    return _own_entries(i, entries, base)
+        return {"strata": [_own_entries(*pair) for pair in zip(entries["strata"], base["strata"], strict=True)]}
+    return _own_entries(entries, base)
 
 
-def _own_entries(i: int, entries: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+def _own_entries(entries: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a refit, or of a stratum of one, that are its own."""
-    if any(entries[k] != base[k] for k in ("low", "high")):
-        raise ValueError(f"refits[{i}] has another box than its base, or is of another kind; a file holds one for all.")
     kept = BETA_SHAPES if "alpha" in base else (*COMPONENT_FIELDS, *(key for key in PART_KEYS if key in base))
     own = {name: entries[name] for name in kept}
     usual = {"coordinates": ["plain"] * len(entries["low"]), "order": []}  # as they are where not written
-    theirs, ours = ({key: each.get(key, usual[key]) for key in COORDINATE_KEYS} for each in (entries, base))
+    theirs, ours = ({key: each.get(key, usual[key]) for key in usual} for each in (entries, base))
     return own if theirs == ours else own | theirs
