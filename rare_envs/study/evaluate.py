@@ -213,7 +213,12 @@ def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
 
 
 def run_into(
-    folder: Path, study: Study, progress: bool = False, force: bool = False, executor: Executor | None = None
+    folder: Path,
+    study: Study,
+    progress: bool = False,
+    force: bool = False,
+    executor: Executor | None = None,
+    part: bool = False,
 ) -> Report:
     """Answer a question and write the answer; finished simulations are kept if the run is interrupted.
 
@@ -223,6 +228,8 @@ def run_into(
         progress: Show a bar on standard error.
         force: Replace a run that the folder has, finished or not.
         executor: As in `run`.
+        part: It is a part of a larger work, which is begun again as a whole: go on with the simulations of the same
+            question that the folder has, and keep all of them at the end. An ego that is an object begins anew.
 
     Returns:
         The report.
@@ -244,10 +251,15 @@ def run_into(
         ['episodes.parquet', 'failures.csv', 'plot.png', 'result.json', 'study.json']
     """
     study = settle_chunk(study, executor)
-    with output_folder(folder), contextlib.closing(writing.begin_journal(folder, study.question, force)) as journal:
-        writing.begin_study_file(folder, study)
-        with _keeping(folder, study, journal) as target:
-            return _finish(target, run(study, progress, journal, executor, target), journal)
+    part = part and not study.ego_was_given
+    begin = partial(writing.begin_journal, folder, study.question, force, go_on=part)
+    with output_folder(folder), contextlib.closing(begin()) as journal:
+        if journal.has_simulations:
+            writing.note_resumption(folder, journal.earlier_seconds)
+        else:
+            writing.begin_study_file(folder, study)
+        with _keeping(folder, study, journal, part) as target:
+            return _finish(target, run(study, progress, journal, executor, target), journal, keep=part)
 
 
 def resume(
@@ -280,18 +292,19 @@ def resume(
             return _finish(target, run(study, progress, journal, executor, target), journal)
 
 
-def _finish(target: Path, report: Report, journal: Journal) -> Report:
-    """Write a report, with the time of a run that it continues; nothing is kept of what it rests on."""
+def _finish(target: Path, report: Report, journal: Journal, keep: bool = False) -> Report:
+    """Write a report, with the time of a run that it continues, and remove the journal unless it is to be kept."""
     earlier = journal.earlier_seconds
     report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
     with arguments.keep_answer(report):
         writing.finish_run(target, report)
-    journal.remove()
+    if not keep:
+        journal.remove()
     return report
 
 
 @contextlib.contextmanager
-def _keeping(folder: Path, study: Study, journal: Journal) -> Iterator[Path]:
+def _keeping(folder: Path, study: Study, journal: Journal, part: bool = False) -> Iterator[Path]:
     """Yield a folder's absolute path, as an ego may change the working one; whatever stops a run says what is kept."""
     target = folder.absolute()
 
@@ -304,8 +317,8 @@ def _keeping(folder: Path, study: Study, journal: Journal) -> Iterator[Path]:
             n_further = journal.n - n if further is None else further.n_sim
             if n_further > 0:
                 count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
-        trust = " --trust" if study.question.trust else ""
-        return f" {count} are kept; go on with: rare-envs resume {shlex.quote(str(folder))}{trust}"
+        again = f"rare-envs resume {shlex.quote(str(folder))}{' --trust' if study.question.trust else ''}"
+        return f" {count} are kept; go on with: {'the same command again' if part else again}"
 
     try:
         yield target

@@ -15,7 +15,7 @@ import samplers
 from agents.saved_ego import SavedEgo
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.exposure import MILLION_KM, CollisionProbability, CollisionRate, explain_no_frequency, read_source
+from rare_envs.exposure import CollisionProbability, CollisionRate, TotalRate, explain_no_frequency, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
@@ -24,7 +24,9 @@ from rare_envs.study.events import COUNTED, EventRate, describe_traffic, find_ca
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
+from samplers.analysis.gate import Decision
 from samplers.analysis.reweight import refit_quantile
+from samplers.analysis.weighted import Reported
 from samplers.evaluate import Fault
 from samplers.sample import Interval
 
@@ -124,20 +126,42 @@ class Repeatability(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateVerdict(samplers.Verdict):
-    """Whether the collisions per million km are below a limit; the ends of p hold the error of the frequency."""
+class RateVerdict(Reported):
+    """Whether the collisions per million km are below a limit; undecided where a warning makes the ends doubtful."""
 
+    decision: Decision
     max_rate: float
     """Limit of the collisions per million km."""
-    per_p: float
-    """Collisions per million km over p."""
+    confidence: float
+    """One-sided confidence of each end."""
+    low: float
+    high: float
+    reason: str
+    """Why it is undecided, beside the ends."""
 
     def __str__(self) -> str:
         """Return one sentence."""
-        low, high = self.per_p * self.low, self.per_p * self.high
-        ends = f"one-sided ends {low:.2g} and {high:.2g} at {100 * self.confidence:.4g} % confidence"
+        ends = f"one-sided ends {self.low:.2g} and {self.high:.2g} at {100 * self.confidence:.4g} % confidence"
         reason = f", as {self.reason}" if self.reason else ""
         return f"{self.decision}: {self.max_rate:g} collisions per million km are the limit, {ends}{reason}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {**super().to_dict(), "text": str(self)}
+
+
+def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> RateVerdict:
+    """Return whether a rate is below a limit; undecided for a reason, if there is one."""
+    low, high = rate.interval_per_million_km
+    decision: Decision = "passes" if high < limit else "fails" if low > limit else "undecided"
+    return RateVerdict(
+        decision="undecided" if reason else decision,
+        max_rate=limit,
+        confidence=round(0.5 + rate.confidence / 2, 12),
+        low=low,
+        high=high,
+        reason=reason,
+    )
 
 
 @dataclass(frozen=True)
@@ -258,31 +282,29 @@ class Report:
         return self.kinds.listed or (None,) * len(self.estimate.failures)
 
     @cached_property
-    def verdict(self) -> samplers.Verdict | None:
+    def verdict(self) -> samplers.Verdict | RateVerdict | None:
         """Whether p, or the rate, is below the limit of the question; None without a limit."""
         question = self.study.question
         if question.max_rate is not None:
-            found: samplers.Verdict = self._judge_rate(question.max_rate)
-        elif question.max_p is not None:
-            found = self.estimate.meets(question.max_p, question.given_base)
-        else:
+            return judge_rate(question.max_rate, self.judged_rate, self.indecision)
+        if question.max_p is None:
             return None
-        doubts = self.doubts_of_f  # the others are the estimate's own
-        if found.reason or not doubts:
-            return found
-        return replace(found, decision="undecided", reason=f"there is a warning: {doubts[0].rstrip('.')}")
+        found = self.estimate.meets(question.max_p, question.given_base)
+        return replace(found, decision="undecided", reason=self.indecision) if self.indecision else found
 
-    def _judge_rate(self, limit: float) -> RateVerdict:
-        """Return whether the rate is below a limit; the errors of the base count unless it is given."""
+    @property
+    def indecision(self) -> str:
+        """Why nothing can be said of a limit, whatever it is; empty where something can."""
+        said = self.estimate.meets(0.5, self.study.question.given_base).reason
+        return said or "".join(f"there is a warning: {doubt.rstrip('.')}" for doubt in self.doubts_of_f[:1])
+
+    @property
+    def judged_rate(self) -> CollisionRate:
+        """The rate whose ends are compared with a limit: with the errors of the base, unless it is taken as given."""
         estimate, given = self.estimate, self.study.question.given_base
         rate = self._rate_of(estimate.p, estimate.cov, estimate.interval, None) if given else self.rate
         assert rate is not None  # `run` has looked for the frequency before
-        scale = MILLION_KM * rate.frequency.per_km
-        of_p = estimate.meets(min(limit / scale, 1.0 - 1e-9), given)  # which knows the doubts of the estimate
-        low, high = rate.interval_per_million_km
-        decision = "passes" if high < limit else "fails" if low > limit else "undecided"
-        known = {"low": low / scale, "high": high / scale, "max_rate": limit, "per_p": scale}
-        return RateVerdict(**{**vars(of_p), **known, "decision": "undecided" if of_p.reason else decision})
+        return rate
 
     @cached_property
     def curve(self) -> samplers.Curve | None:

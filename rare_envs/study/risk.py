@@ -27,11 +27,14 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, build_problem, prepare
-from rare_envs.study.report import Report, find_frequency
+from rare_envs.study.report import RateVerdict, Report, find_frequency, judge_rate
+from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import check_no_results
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
+RISK = "risk.json"
+"""Numbers of a risk, the last file that is written."""
 TWICE = ("cut_in", "car_following")
 """Scenarios of which a set may have one: a cut-in gives the ego a new leader, so that car-following behind new leaders
 contains the cut-ins."""
@@ -172,6 +175,17 @@ class Risk:
         """Contacts of people in the same events together; None where those of one kind were not counted."""
         return sum_people(self.events)
 
+    @cached_property
+    def verdict(self) -> RateVerdict | None:
+        """Whether the sum is below the limit of the question; None without a limit."""
+        limit = self.scenarios[0].report.study.question.max_rate
+        if limit is None:
+            return None
+        rates = (replace(each.report.judged_rate, site_log_sd=each.rate.site_log_sd) for each in self.scenarios)
+        missing = [f"{text.name_scenario(name)} is left out" for name in self.left_out]
+        reasons = filter(None, [*missing, *(each.report.indecision for each in self.scenarios)])
+        return judge_rate(limit, exposure.TotalRate(tuple(rates)), next(reasons, ""))
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """Doubts about p and about the error of its base distribution, by scenario."""
@@ -196,6 +210,7 @@ class Risk:
         beside += f"; uncalibrated in {missed}" if missed else ""
         lines = [
             f"{self.ego}: collisions per million km {per_km}{beside}",
+            *(f"  limit        {verdict}" for verdict in filter(None, [self.verdict])),
             *(f"  {line}" for line in text.tabulate_events(self.events)),
         ]
         if whole > 0:
@@ -219,6 +234,7 @@ class Risk:
             "injuries": None if self.injuries is None else self.injuries.to_dict(),
             "events": [each.to_dict() for each in self.events],
             "people": None if self.people is None else self.people.to_dict(),
+            "gate": None if self.verdict is None else self.verdict.to_dict(),
             "left_out": dict(self.left_out),
             "doubtful": bool(self.warnings),
             "warnings": list(self.warnings),
@@ -256,10 +272,12 @@ def risk(
             first are used, and the spread of the rate between it and the others is part of the interval. Each
             scenario must have a base of the first site, or one in `bases`.
         bases: Base distributions, names or JSON files, by scenario, in place of those of the first site.
-        out: Folder for the picture, the numbers and a folder of each scenario, see `rare-envs risk --out`.
+        out: Folder for the picture, the numbers and a folder of each scenario. After an interruption the same call
+            goes on with the simulations that it has, unless the ego is an object.
         progress: Show a bar on standard error.
         force: Replace runs that the folder has, finished or not.
-        **options: Further fields of `rare_envs.study.Question`: seed, max_sim (of each scenario), method, and so on.
+        **options: Further fields of `rare_envs.study.Question`: seed, max_sim (of each scenario), method, max_rate (a
+            limit of the sum, see `Risk.verdict`) and so on.
 
     Raises:
         BadInput: An argument cannot be used; a scenario has no frequency of its events; or the ego failed.
@@ -277,7 +295,9 @@ def risk(
     with as_bad_input(ValueError):
         _check_scenarios(scenarios, sites, bases)
         chosen = [choose_base(scenario_named(name), bases.get(name), sites[0]) for name in scenarios]
-    with as_bad_input(TypeError):
+    with as_bad_input(TypeError, ValueError):
+        if options.get("max_p") is not None:
+            raise ValueError("Expected max_rate, a limit of the sum, not max_p.")
         asked = {"ego": ego_name, **options}
         questions = [
             Question(env_id=env_id_of(name), base=base, **asked) for name, base in zip(scenarios, chosen, strict=True)
@@ -291,8 +311,10 @@ def risk(
         studies = [prepare(question, None if named else ego) for question in fitting.values()]
         for study in studies:
             find_frequency(study)
-    for name in fitting if folder is not None and not force else ():  # all of them, before the first one is run
-        check_no_results(Path(folder or "", name))
+    if folder is not None and not force:  # all of them, before the first one is run
+        check_no_results(folder, RISK)
+        for part in (folder / name for name in fitting if not (folder / name / JOURNAL).exists()):
+            check_no_results(part)
     done: list[ScenarioRisk] = []
     for study in studies:
         try:
@@ -302,8 +324,10 @@ def risk(
             raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
     found = Risk(ego=ego_name, scenarios=tuple(done), left_out=left_out)
     if folder is not None:
-        replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
         found.save_plot(folder / "risk.png")
+        replace_text(folder / RISK, format_json(found.to_dict()) + "\n")
+        for name in fitting:
+            (folder / name / JOURNAL).unlink(missing_ok=True)
     return found
 
 
@@ -349,7 +373,7 @@ def _evaluate(
 ) -> ScenarioRisk:
     """Run one scenario and return its rate, with the spread between sites if there are others."""
     name = study.problem.world.scenario.name
-    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, force)
+    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, force, part=True)
     assert report.rate is not None  # `risk` has looked for the frequency before
     with keep_answer(report):
         factors = compare_sites(report, other_sites, progress)

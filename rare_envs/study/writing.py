@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import platform
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -37,8 +38,8 @@ BEGIN_AGAIN = "give the command again."
 """Advice where there is nothing to continue."""
 
 
-def begin_journal(folder: Path, question: Question, force: bool = False) -> Journal:
-    """Return the journal of a new run; with `force` it replaces that of an unfinished one."""
+def begin_journal(folder: Path, question: Question, force: bool = False, go_on: bool = False) -> Journal:
+    """Return the journal of a new run; `force` replaces that of an unfinished one, `go_on` continues it."""
     if not force and not (folder / run_folder.JOURNAL).exists():
         check_no_results(folder)
     head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
@@ -47,12 +48,23 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
     except JournalError as error:
         if "already" not in str(error):
             raise BadInput(error) from error
+        if go_on:
+            return _continue_same(folder, head)
         raise BadInput(
             f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume "
             f"{shlex.quote(str(folder))}, or replace it by --force."
         ) from error
     except OSError as error:
         raise BadInput(f"Cannot write to the folder {str(folder)!r}: {error.strerror}.") from error
+
+
+def _continue_same(folder: Path, head: Mapping[str, Any]) -> Journal:
+    """Return the journal of an unfinished run of the question and files of a head."""
+    journal, _ = continue_journal(folder)
+    if journal.head == json.loads(json.dumps(head)):
+        return journal
+    journal.close()
+    raise BadInput(f"The run in {str(folder)!r} is of another question, or of other files: replace it by --force.")
 
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:

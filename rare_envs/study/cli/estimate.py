@@ -20,7 +20,7 @@ from rare_envs.study.arguments import (
     read_question_file,
 )
 from rare_envs.study.cli import shell
-from rare_envs.study.cli.shell import DOUBTFUL, Answer, command, describe_report, option_of
+from rare_envs.study.cli.shell import DOUBTFUL, GATE_CODES, Answer, command, describe_report, option_of
 
 if TYPE_CHECKING:
     from samplers import Estimate, Executor
@@ -61,9 +61,8 @@ def estimate_command(
     if "env_id" not in chosen:
         raise BadInput("Expected an environment: rare-envs estimate ENV, or env: ENV in the file of --config.")
     question = Question(**chosen)
-    for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
-        if not question.has_limit and name in typed | set(given):
-            raise BadInput(f"Expected {option} together with --max-p or --max-rate, the limit.")
+    if not question.has_limit:
+        refuse_without_limit(typed | set(given), "--max-p or --max-rate")
     with as_bad_input(ValueError):
         executor = ExecutorOptions(**of_executor).make()
     if is_highway_env_id(question.env_id):
@@ -82,6 +81,13 @@ def estimate_command(
 
     estimate = run if out is None else partial(run_into, out, force=force)
     return describe_report(estimate(prepare(question), progress=True, executor=executor), out, details)
+
+
+def refuse_without_limit(typed: set[str], limits: str) -> None:
+    """Raise a BadInput that names an option about a limit, where there is none."""
+    for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
+        if name in typed:
+            raise BadInput(f"Expected {option} together with {limits}, the limit.")
 
 
 def format_seconds(seconds: float) -> str:
@@ -208,11 +214,14 @@ def plan_command(
 
 
 @command(
-    "method", "ensemble_run", "device", "seed", *shell.EGO_FILE, "trust", "observation", "action", stopped=NOTHING_MADE
+    *("method", "ensemble_run", "device", "seed", *shell.EGO_FILE, "trust", "observation", "action"),
+    *("max_rate", "gate_confidence", "given_base"),
+    stopped=NOTHING_MADE,
 )
 def risk_command(
     ego: shell.EgoArgument,
     asked: dict[str, Any],
+    typed: set[str],
     scenario: Annotated[
         list[str] | None, Option(help="Scenario of the sum; may be repeated.", show_default="cut_in and hard_brake")
     ] = None,
@@ -230,6 +239,8 @@ def risk_command(
     """Estimate collisions per million km, summed over scenarios, with an interval."""
     from rare_envs.study.risk import SCENARIO_SET, risk
 
+    if asked["max_rate"] is None:
+        refuse_without_limit(typed, "--max-rate")
     bases: dict[str, str] = {}
     for owner, _, name in (word.partition("=") for word in base or []):
         if not owner or not name:
@@ -250,7 +261,8 @@ def risk_command(
             **asked,
         )
     text = str(found) if out is None else f"{found}\nWrote {out}."
-    return Answer(found.to_dict(), text, DOUBTFUL if found.warnings else 0)
+    code = DOUBTFUL if found.warnings else 0
+    return Answer(found.to_dict(), text, code if found.verdict is None else GATE_CODES[found.verdict.decision])
 
 
 @command(*shell.ASKED, stopped=NOTHING_MADE)
