@@ -1,13 +1,14 @@
-"""Exposure: from a probability per event to collisions per hour and per kilometre.
+"""Exposure: from a probability per event to collisions per million kilometres.
 
 With lambda the frequency of the events and p the probability that one of them ends in a collision, the rate is
 R = lambda p. Both factors are wide, so that errors add up in logarithms:
 
-    sd(log R)^2 = 1 / n + (1 - q) / (q k) + cov^2 + s^2 + s_site^2,    R exp(-z sd) to R exp(z sd),
+    sd(log R)^2 = 1 / n + (1 - q) / (q k) + s_p^2 + s^2 + s_site^2,    R exp(-z sd) to R exp(z sd),
 
-for n counted events of which a share q, known from k others, is as the scenario describes; cov of the estimate; s the
-spread of log p over the refits of the base distribution, with the bias of a fit; s_site the spread between sites.
-Where refits are known, cov and s count (t / z)^2 fold: t is the quantile of Student's t for as few clusters of events.
+for n counted events of which a share q, known from k others, is as the scenario describes; s_p the c.o.v. of the
+estimate of p; s the spread of log p over the refits of the base distribution, with the bias of a fit; s_site the spread
+between sites. Where refits are known, s_p and s are t / z fold: t is the quantile of Student's t for as few clusters of
+events.
 
 Where p has an interval of its own, with other distances below and above log p (families of refits, the share that a
 search may have missed), each side adds up by itself (Zou, Donner, "Construction of confidence limits about effect
@@ -15,7 +16,7 @@ measures: a general approach", Statistics in Medicine 27, 2008):
 
     log R_low = log R - sqrt((log p - log p_low)^2 + z^2 (1 / n + (1 - q) / (q k) + s_site^2)),
 
-and in the same way upwards. For an interval p exp(-+ t S) that is the formula above.
+and in the same way upwards.
 
 Rates of several scenarios are added, with their variances, not their logarithms. As they are wide and skewed, the
 interval is that of the sum of draws from each. Scenarios whose bases were fitted to the same events share that error. A
@@ -36,7 +37,7 @@ from scipy.special import ndtri
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.events import EventFrequency
 
-__all__ = ["CollisionProbability", "CollisionRate", "TotalRate", "VarianceShare"]
+__all__ = ["CollisionRate", "TotalRate", "VarianceShare"]
 
 SOURCE_FIELDS = ("site", "date", "data", "licence")
 """Of a record: its entries, or those of its `source`."""
@@ -71,52 +72,35 @@ MILLION_KM = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollisionProbability:
-    """Probability of a collision per event, with what is known of its error.
-
-    Example:
-        >>> CollisionProbability(p=1.8e-5, cov=0.02, upper=2e-5, spread=1.1).determined
-        True
-    """
-
-    p: float
-    cov: float
-    """Coefficient of variation of the estimate; any value where p = 0."""
-    upper: float
-    """Upper end of p: of the sampling interval, or where the events do not determine p, its bound."""
-    spread: float | None = None
-    """Standard deviation of log p over the refits of the base; None where it is not known."""
-    fit_bias: float = 0.0
-    """Bias of the fit itself in log p, which counts beside the spread."""
-    quantile: float | None = None
-    """Quantile of Student's t for the number of clusters of events; None for that of a normal distribution."""
-    interval: RateInterval | None = None
-    """Interval of p with all these errors, of the confidence of the rate; None for that which they give alike below and
-    above log p."""
-    determined: bool = True
-    """Whether the events behind the base determine p; if not, `upper` alone is known."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class CollisionRate:
-    """Collisions per hour and per million km in one scenario.
+    """Collisions per million km in one scenario.
+
+    Raises:
+        ValueError: p is 0 and has no interval.
 
     Example:
-        Brakings of the vehicle ahead happen 47.5 times an hour; two in 100,000 end in a collision.
+        Brakings of the vehicle ahead happen 1.23 times per km; two in 100,000 end in a collision.
 
         >>> counted = EventFrequency(count=268, hours=5.64, km=218.0, definition="brakings", source="US 101")
-        >>> p = CollisionProbability(p=1.8e-5, cov=0.02, upper=2e-5)
-        >>> rate = CollisionRate(scenario="hard_brake", probability=p, frequency=counted)
-        >>> low, high = rate.interval_per_hour
-        >>> f"{rate.per_hour:.1e} per hour, {low:.1e} to {high:.1e}"
-        '8.6e-04 per hour, 7.5e-04 to 9.7e-04'
+        >>> rate = CollisionRate(scenario="hard_brake", frequency=counted, p=1.8e-5, sampling_log_sd=0.02)
+        >>> low, high = rate.interval_per_million_km
+        >>> f"{rate.per_million_km:.0f} per million km, {low:.0f} to {high:.0f}"
+        '22 per million km, 20 to 25'
     """
 
     scenario: str
     """Name of the scenario."""
-    probability: CollisionProbability
     frequency: EventFrequency
     """How often its events happen."""
+    p: float
+    """Probability that an event ends in a collision."""
+    sampling_log_sd: float = 0.0
+    """Standard deviation of log p by the number of simulations, t / z fold where that counts."""
+    base_log_sd: float = 0.0
+    """The same by the events that the base was fitted to; 0 where it is not known."""
+    interval: RateInterval | None = None
+    """Interval of p with these errors, of the confidence of the rate; it begins at 0 where p is not determined. None
+    for that which the deviations give alike below and above log p."""
     site_log_sd: float = 0.0
     """Standard deviation of log R between sites; 0 for the rate at the site of the base."""
     confidence: float = 0.95
@@ -124,54 +108,50 @@ class CollisionRate:
     fitted_to: str = ""
     """Events that the base was fitted to: scenarios with the same ones share the error of their bases."""
 
-    @property
-    def per_hour(self) -> float:
-        """Collisions per hour of driving."""
-        return self.frequency.per_hour * self.probability.p
+    def __post_init__(self) -> None:
+        if self.p <= 0 and self.interval is None:
+            raise ValueError(f"Expected an interval of p = {self.p:g}: nothing else gives its upper end.")
 
     @property
     def per_million_km(self) -> float:
         """Collisions per million kilometres."""
-        return MILLION_KM * self.frequency.per_km * self.probability.p
+        return MILLION_KM * self.frequency.per_km * self.p
 
     @property
     def determined(self) -> bool:
         """Whether the rate has an interval on both sides: something failed, and the events determine p."""
-        return self.probability.determined and self.probability.p > 0
+        return self.p > 0 and (self.interval is None or self.interval[0] > 0)
 
     @property
     def log_variance(self) -> dict[str, float]:
-        """Parts of the variance of log R; of them the interval is made where p has none of its own.
+        """Parts of the variance of log R.
 
         From the number of counted events, the number of simulations, the events that the base was fitted to, and the
         difference between sites.
         """
-        one = self.probability
-        factor = 1.0 if one.quantile is None else (one.quantile / normal_quantile(self.confidence)) ** 2
-        spread = 0.0 if one.spread is None else one.spread**2 + one.fit_bias**2
-        return {
-            "counts": self.frequency.log_sd**2,
-            "sampling": factor * one.cov**2,
-            "base": factor * spread,
-            "site": self.site_log_sd**2,
-        }
-
-    @property
-    def interval_per_hour(self) -> RateInterval:
-        """Interval of `per_hour`; from 0 where p is not determined."""
-        return self._scale_interval(1.0 / self.frequency.hours)
+        deviations = {"sampling": self.sampling_log_sd, "base": self.base_log_sd, "site": self.site_log_sd}
+        return {"counts": self.frequency.log_sd**2, **{name: sd**2 for name, sd in deviations.items()}}
 
     @property
     def interval_per_million_km(self) -> RateInterval:
         """Interval of `per_million_km`; from 0 where p is not determined."""
-        return self._scale_interval(MILLION_KM / self.frequency.km)
+        counted, z = self.frequency, normal_quantile(self.confidence)
+        if counted.count < FEW_EVENTS:
+            rng = np.random.default_rng(0)
+            drawn = self.draw(rng.standard_normal(RATE_DRAWS), rng)
+            low, high = (float(end) for end in np.quantile(drawn, tail_levels(self.confidence)))
+            return (low if self.determined else 0.0), high
+        scale, rest = MILLION_KM * counted.per_km, z * math.hypot(counted.log_sd, self.site_log_sd)
+        most = math.exp(z * counted.log_sd)  # p is 1 at most, at any site
+        if self.interval is not None and not self.determined:
+            return 0.0, scale * min(self.interval[1] * math.exp(rest), most)
+        below, above = (math.exp(math.hypot(distance, rest)) for distance in self._log_distances())
+        return scale * self.p / below, scale * min(self.p * above, most)
 
     @property
     def shares(self) -> dict[str, float]:
         """Parts of the variance of log R as shares of it; empty where the rate is not determined."""
-        if not self.determined:
-            return {}
-        parts = self.log_variance
+        parts = self.log_variance if self.determined else {}
         return {name: float(part / sum(parts.values())) for name, part in parts.items()}
 
     def to_dict(self) -> dict[str, Any]:
@@ -179,26 +159,22 @@ class CollisionRate:
         frequency = self.frequency
         return {
             "scenario": self.scenario,
-            "p": self.probability.p,
-            "p_interval": None if self.probability.interval is None else list(self.probability.interval),
-            "per_hour": self.per_hour,
-            "interval_per_hour": list(self.interval_per_hour),
+            "p": self.p,
+            "p_interval": None if self.interval is None else list(self.interval),
             "per_million_km": self.per_million_km,
             "interval_per_million_km": list(self.interval_per_million_km),
             "confidence": self.confidence,
             "determined": self.determined,
-            "spread": self.probability.spread,
             "site_log_sd": self.site_log_sd,
             "shares_of_variance": self.shares,
             "frequency": {**asdict(frequency), "per_hour": frequency.per_hour, "per_km": frequency.per_km},
             "fitted_to": self.fitted_to,
         }
 
-    def draw(self, exposure: float, base_normal: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def draw(self, base_normal: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw rates (n,) from the distribution that the interval describes; of p at its upper end if not determined.
 
         Args:
-            exposure: Hours, or kilometres, in which the events were counted; the rate is per unit of it.
             base_normal: Standard normal errors of the base distribution, shape (n,), which scenarios may share.
             rng: Source of the other errors.
         """
@@ -207,41 +183,24 @@ class CollisionRate:
         events = rng.gamma(counted.count + 0.5, size=n) if few else np.full(n, float(counted.count))
         counts = max(parts["counts"] - 1 / counted.count, 0.0) if few else parts["counts"]  # few: of the share alone
         log_events = math.log(counted.share) + np.log(events) + math.sqrt(counts) * rng.standard_normal(n)
-        other = math.sqrt(parts["site"]) * rng.standard_normal(n)
-        if self.determined:
+        log_p = self.site_log_sd * rng.standard_normal(n)
+        if self.interval is not None and not self.determined:
+            log_p += math.log(self.interval[1])
+        else:
             (below, above), z = self._log_distances(), normal_quantile(self.confidence)
             own = parts["sampling"] + parts["base"]
             of_base = parts["base"] / own if own > 0 else 0.0
             error = math.sqrt(of_base) * base_normal + math.sqrt(1.0 - of_base) * rng.standard_normal(n)
-            log_p = math.log(self.probability.p) + np.where(error < 0, below, above) / z * error + other
-        else:
-            log_p = math.log(self.probability.upper) + other
-        return np.exp(log_events + np.minimum(log_p, 0.0)) / exposure  # a probability is 1 at most
-
-    def _scale_interval(self, scale: float) -> RateInterval:
-        """Return the interval of count x share x p, times a scale."""
-        counted, z = self.frequency, normal_quantile(self.confidence)
-        if counted.count < FEW_EVENTS:
-            rng = np.random.default_rng(0)
-            drawn = scale * self.draw(1.0, rng.standard_normal(RATE_DRAWS), rng)
-            low, high = (float(end) for end in np.quantile(drawn, tail_levels(self.confidence)))
-            return (low if self.determined else 0.0), high
-        parts, events = self.log_variance, scale * counted.count * counted.share
-        most = math.exp(z * math.sqrt(parts["counts"]))  # p is 1 at most, at any site
-        rest = z * math.sqrt(parts["counts"] + parts["site"])
-        if not self.determined:
-            return 0.0, events * min(self.probability.upper * math.exp(rest), most)
-        below, above = (float(np.exp(np.hypot(distance, rest))) for distance in self._log_distances())
-        return events * self.probability.p / below, events * min(self.probability.p * above, most)
+            log_p += math.log(self.p) + np.where(error < 0, below, above) / z * error
+        return np.exp(log_events + np.minimum(log_p, 0.0)) * MILLION_KM / counted.km  # a probability is 1 at most
 
     def _log_distances(self) -> RateInterval:
-        """Return how far the ends of the interval of p are below and above log p > -inf."""
-        one, parts = self.probability, self.log_variance
-        if one.interval is None:
-            half = normal_quantile(self.confidence) * math.sqrt(parts["sampling"] + parts["base"])
+        """Return how far the ends of the interval of p > 0 are below and above log p."""
+        if self.interval is None:
+            half = normal_quantile(self.confidence) * math.hypot(self.sampling_log_sd, self.base_log_sd)
             return half, half
-        low, high = one.interval
-        return math.log(one.p / low) if low > 0 else math.inf, math.log(high / one.p)
+        low, high = self.interval
+        return math.log(self.p / low), math.log(high / self.p)
 
 
 def normal_quantile(confidence: float) -> float:
@@ -272,12 +231,13 @@ class VarianceShare(NamedTuple):
 
 @dataclass(frozen=True)
 class TotalRate:
-    """Collisions per hour and per million km over scenarios that count nothing twice.
+    """Collisions per million km over scenarios that count nothing twice.
 
     Example:
         >>> brakings = EventFrequency(count=42, hours=5.64, km=218.0, definition="brakings", source="US 101")
-        >>> p = CollisionProbability(p=1.8e-5, cov=0.02, upper=2e-5, spread=1.1)
-        >>> total = TotalRate((CollisionRate(scenario="hard_brake", probability=p, frequency=brakings),))
+        >>> rate = CollisionRate(
+        ...     scenario="hard_brake", frequency=brakings, p=1.8e-5, sampling_log_sd=0.02, base_log_sd=1.1)
+        >>> total = TotalRate((rate,))
         >>> low, high = total.interval_per_million_km
         >>> print(f"{total.per_million_km:.1f} ({low:.2f} to {high:.0f}), {total.shares[0].share:.0%} from the base")
         3.5 (0.39 to 31), 98% from the base
@@ -291,13 +251,8 @@ class TotalRate:
 
     @property
     def confidence(self) -> float:
-        """Nominal coverage of the intervals."""
+        """Nominal coverage of the interval."""
         return self.rates[0].confidence
-
-    @property
-    def per_hour(self) -> float:
-        """Collisions per hour of driving."""
-        return sum(rate.per_hour for rate in self.rates)
 
     @property
     def per_million_km(self) -> float:
@@ -305,14 +260,22 @@ class TotalRate:
         return sum(rate.per_million_km for rate in self.rates)
 
     @cached_property
-    def interval_per_hour(self) -> RateInterval:
-        """Interval of `per_hour`."""
-        return self._interval("interval_per_hour", [rate.frequency.hours for rate in self.rates])
-
-    @cached_property
     def interval_per_million_km(self) -> RateInterval:
-        """Interval of `per_million_km`."""
-        return self._interval("interval_per_million_km", [rate.frequency.km / MILLION_KM for rate in self.rates])
+        """Interval of `per_million_km`: of the sum of the determined rates, and above it the others' upper ends."""
+        if len(self.rates) == 1:
+            return self.rates[0].interval_per_million_km
+        rng = np.random.default_rng(0)
+        groups: dict[str, FloatArray] = {}
+        drawn, above = np.zeros(RATE_DRAWS), 0.0
+        for number, rate in enumerate(self.rates):
+            if not rate.determined:
+                above += rate.interval_per_million_km[1]
+                continue
+            key = rate.fitted_to or f"scenario {number}"
+            groups.setdefault(key, rng.standard_normal(RATE_DRAWS))
+            drawn += rate.draw(groups[key], rng)
+        low, high = np.quantile(drawn, tail_levels(self.confidence))
+        return float(low), float(high) + above
 
     @property
     def determined(self) -> tuple[CollisionRate, ...]:
@@ -348,31 +311,8 @@ class TotalRate:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return {
-            "per_hour": self.per_hour,
-            "interval_per_hour": list(self.interval_per_hour),
             "per_million_km": self.per_million_km,
             "interval_per_million_km": list(self.interval_per_million_km),
             "confidence": self.confidence,
             "shares_of_variance": [each._asdict() for each in self.shares],
         }
-
-    def _interval(self, name: str, exposures: list[float]) -> RateInterval:
-        """Return the interval of the sum of the determined rates, and above it the upper ends of the others.
-
-        Each rate has its own interval of this name, per unit of its exposure.
-        """
-        single: list[RateInterval] = [getattr(rate, name) for rate in self.rates]
-        if len(single) == 1:
-            return single[0]
-        rng = np.random.default_rng(0)
-        groups: dict[str, FloatArray] = {}
-        drawn, above = np.zeros(RATE_DRAWS), 0.0
-        for number, (rate, exposure, (_, high)) in enumerate(zip(self.rates, exposures, single, strict=True)):
-            if not rate.determined:
-                above += high
-                continue
-            key = rate.fitted_to or f"scenario {number}"
-            groups.setdefault(key, rng.standard_normal(RATE_DRAWS))
-            drawn += rate.draw(exposure, groups[key], rng)
-        low, high = np.quantile(drawn, tail_levels(self.confidence))
-        return float(low), float(high) + above

@@ -50,8 +50,6 @@ class HumanBenchmark:
     count: int
     miles: float
     """Distance driven."""
-    hours: float | None
-    """Time driven; None where it is not given."""
     source: str
     words: str
     """Words of the source, or how the count was made."""
@@ -60,11 +58,6 @@ class HumanBenchmark:
     def per_million_km(self) -> float:
         """Events per million kilometres."""
         return MILLION_KM * self.count / (self.miles * KM_PER_MILE)
-
-    @property
-    def per_hour(self) -> float | None:
-        """Events per hour; None where the hours are not given."""
-        return None if self.hours is None else self.count / self.hours
 
     @property
     def interval_per_million_km(self) -> RateInterval:
@@ -83,7 +76,7 @@ class HumanBenchmark:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         rates = {"per_million_km": self.per_million_km, "interval_per_million_km": list(self.interval_per_million_km)}
-        return {**asdict(self), **rates, "per_hour": self.per_hour}
+        return {**asdict(self), **rates}
 
 
 def _count_100car(kind: str, count: int, how: str) -> HumanBenchmark:
@@ -93,10 +86,8 @@ def _count_100car(kind: str, count: int, how: str) -> HumanBenchmark:
         kind=kind,
         count=count,
         miles=2_000_000.0,
-        hours=43_000.0,
         source="Virginia Tech Transportation Institute, Researcher Dictionary for Video Reduction Data 1.3, page 4",
-        words=f'"approximately 2,000,000 vehicles miles and 43,000 hours"; {how}, counted in the published table '
-        "of 828 events",
+        words=f'"approximately 2,000,000 vehicles miles"; {how}, counted in the published table of 828 events',
     )
 
 
@@ -106,7 +97,6 @@ def _count_shrp2(kind: str, count: int) -> HumanBenchmark:
         kind=kind,
         count=count,
         miles=34.5e6,
-        hours=None,
         source="Kidd and McCartt 2015 (crashes); Ali, dissertation, Virginia Tech, 2023 (miles)",
         words="\"Of 1,465 crashes ... 248 were severe ...; 597 were 'minor;' and 620 were 'low-risk tire strikes'\"; "
         '"34.5 million miles"; the two from different papers',
@@ -255,6 +245,15 @@ class EventCalibration:
     def is_calibrated(self) -> bool:
         """Whether `human` has contacts within a factor `CALIBRATED_WITHIN` of people's interval."""
         return 1.0 / CALIBRATED_WITHIN <= self.factor() <= CALIBRATED_WITHIN
+
+    def per_million_km(self, driver: str = "human") -> ModelCount:
+        """Return contacts per million km of a driver, with their interval."""
+        return ModelCount(*(MILLION_KM * self.per_km * each for each in self.drivers[driver]["contacts"]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        contacts = {driver: self.per_million_km(driver)._asdict() for driver in self.drivers}
+        return {"base": self.base, "factor": self.factor(), "contacts_per_million_km": contacts}
 
 
 @cache

@@ -10,20 +10,19 @@ refit of the base has shares of its own.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 import samplers
-from rare_envs.exposure import MILLION_KM, CollisionRate, RateInterval
+from rare_envs.exposure import CollisionRate
 from rare_envs.people import Event, EventCalibration, HumanBenchmark, calibration, people_in
 from rare_envs.scenarios.registry import env_id_of, find_scenario
 from samplers import analysis
 from samplers.analysis.base_error import BaseUncertainty
-from samplers.problem import FloatArray
-from samplers.sample import Interval
+from samplers.problem import read_strata
 
 if TYPE_CHECKING:
     from rare_envs.study.question import Study
@@ -32,20 +31,6 @@ MODEL, BRACKET = "human", "human:no-headway-rule"
 """The human driver model, and the one that brackets people together with it."""
 COUNTED: tuple[str, ...] = get_args(Event)
 """Events of which people's contacts were counted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartValue:
-    """Share times p of a stratum, with its errors."""
-
-    name: str
-    share: float
-    value: float
-    cov: float
-    interval: Interval
-    """Sampling interval."""
-    base: BaseUncertainty | None
-    """What the events behind the base leave open, the share included; None where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +44,8 @@ class EventRate:
     """Share of the scenario's events that are of this kind."""
     parts: Mapping[str, float]
     """Shares of the rate by stratum; empty where there is one stratum, or nothing failed."""
+    unresolved: Mapping[str, float] = field(default_factory=dict)
+    """Upper ends of the rate [per million km] in strata whose simulations met no failure, or hardly any."""
     traffic: str
     """The base distribution, and the options that make other traffic of it."""
     calibration: EventCalibration | None
@@ -80,32 +67,17 @@ class EventRate:
         times = f"{factor:.2g} times above" if factor > 1.0 else f"{1.0 / factor:.2g} times below"
         return f"uncalibrated, {times} people"
 
-    def model_interval(self, driver: str = MODEL) -> tuple[float, RateInterval] | None:
-        """Return contacts per million km of a human driver model, and their interval."""
-        if self.calibration is None:
-            return None
-        scale, count = MILLION_KM * self.calibration.per_km, self.calibration.drivers[driver]["contacts"]
-        return scale * count.p, (scale * count.low, scale * count.high)
-
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        models = {name: self.model_interval(name) for name in (MODEL, BRACKET)}
         return {
             "event": self.event,
             "share_of_events": self.share,
             **self.rate.to_dict(),
             "parts": dict(self.parts),
+            "unresolved": dict(self.unresolved),
             "people": None if self.people is None else self.people.to_dict(),
             "uncalibrated": self.uncalibrated,
-            "calibration": None
-            if self.calibration is None
-            else {
-                "base": self.calibration.base,
-                "factor": self.calibration.factor(),
-                "per_million_km": {
-                    name: {"value": found[0], "interval": list(found[1])} for name, found in models.items() if found
-                },
-            },
+            "calibration": None if self.calibration is None else self.calibration.to_dict(),
         }
 
 
@@ -135,41 +107,18 @@ def find_calibration(event: str, study: Study) -> EventCalibration | None:
     return calibration(event, describe_traffic(study)) if newest else None  # type: ignore[arg-type]
 
 
-def list_strata(base: Any) -> tuple[Any, ...]:
-    """Return the strata of a base distribution, each with `name`, `share` and `base`; none where it has but one."""
-    found = tuple(getattr(base, "strata", None) or ())
-    return found if len(found) > 1 else ()
+def list_part_errors(estimate: samplers.Estimate) -> list[BaseUncertainty | None]:
+    """Return what the events behind the base leave open of share times p of each of `estimate.parts`, share included.
 
-
-def stratum_of(strata: Sequence[Any], x: FloatArray) -> NDArray[np.intp]:
-    """Return the number of the stratum of each point x (n, d), shape (n,)."""
-    found: NDArray[np.intp] = np.argmax([np.log(each.share) + each.base.log_prob(x) for each in strata], axis=0)
-    return found
-
-
-def split_by_stratum(estimate: samplers.Estimate, base: Any) -> tuple[PartValue, ...]:
-    """Return share times p of each stratum of a base distribution, from the estimate of the sum."""
-    strata = list_strata(base)
-    if not strata:
-        return ()
+    None where nothing failed, or the base has no refits.
+    """
     try:
         failures = analysis.weigh_failures(estimate)
     except ValueError:  # nothing failed, or p is no sum over points
-        uncertainties: list[BaseUncertainty | None] = [None] * len(strata)
-    else:
-        which = stratum_of(strata, failures.x)
-        uncertainties = [_find_base_error(estimate, failures, which == k) for k in range(len(strata))]
-    return tuple(
-        PartValue(
-            name=part.name,
-            share=part.share,
-            value=part.share * part.p,
-            cov=part.cov,
-            interval=(part.share * part.interval[0], part.share * part.interval[1]),
-            base=uncertainty,
-        )
-        for part, uncertainty in zip(estimate.parts, uncertainties, strict=True)
-    )
+        return [None] * len(estimate.parts)
+    strata = read_strata(estimate.base)
+    which = np.argmax([each.base.log_prob(failures.x) for each in strata], axis=0)  # densities are 0 in the others
+    return [_find_base_error(estimate, failures, which == k) for k in range(len(estimate.parts))]
 
 
 def _find_base_error(

@@ -15,12 +15,12 @@ import samplers
 from agents.saved_ego import SavedEgo
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.egos.wrappers import describe_missing_normalisation
-from rare_envs.exposure import CollisionProbability, CollisionRate, TotalRate, explain_no_frequency, read_source
+from rare_envs.exposure import MILLION_KM, CollisionRate, TotalRate, explain_no_frequency, normal_quantile, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
-from rare_envs.study.events import COUNTED, EventRate, describe_traffic, find_calibration, split_by_stratum
+from rare_envs.study.events import COUNTED, EventRate, describe_traffic, find_calibration, list_part_errors
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
@@ -28,6 +28,7 @@ from samplers.analysis.gate import Decision
 from samplers.analysis.reweight import refit_quantile
 from samplers.analysis.weighted import Reported
 from samplers.evaluate import Fault
+from samplers.replicate import UNINFORMATIVE_COV
 from samplers.sample import Interval
 
 MOST_DIFFERING = 0.05
@@ -76,7 +77,7 @@ def find_frequency(study: Study) -> EventFrequency:
         reason += explain_no_frequency({} if base is None else base.record)
     else:
         return base.frequency
-    raise ValueError(f"no rate per hour or km: {reason}")
+    raise ValueError(f"no rate per km: {reason}")
 
 
 def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, ...]:
@@ -322,41 +323,49 @@ class Report:
 
     @cached_property
     def rate(self) -> CollisionRate | None:
-        """Collisions per hour and per km; None where `no_rate` says why there are none."""
+        """Collisions per million km; None where `no_rate` says why there are none."""
         estimate = self.estimate
         return self._rate_of(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
 
     @cached_property
     def events(self) -> tuple[EventRate, ...]:
         """The rate of each kind of event that the scenario stands for; empty where `no_rate` says why there is none."""
-        if self.rate is None:
+        whole, parts = self.rate, self.estimate.parts
+        if whole is None:
             return ()
-        parts = split_by_stratum(self.estimate, self.study.problem.base)
-        whole = {part.name: part.value / self.estimate.p for part in parts if self.estimate.p > 0}
-        whole_p = self.rate.probability
-        most = whole_p.upper if whole_p.interval is None or not whole_p.determined else whole_p.interval[1]
-        found = [
-            (part.name, part.share, self._rate_of(part.value, part.cov, part.interval, part.base, most))
-            for part in parts
-        ]
-        if not parts or any(part.name not in COUNTED for part in parts):
-            found = [(self.rate.scenario, 1.0, self.rate)]
+        apart = bool(parts) and all(part.name in COUNTED for part in parts)
+        found = self._rate_parts(whole) if apart else [(whole.scenario, 1.0, whole)]
+        shares = {} if apart or not self.estimate.p else {part.name: part.of_sum for part in parts}
+        scale = MILLION_KM * whole.frequency.per_km
+        vague = () if apart else (part for part in parts if part.p == 0 or part.cov >= UNINFORMATIVE_COV)
+        unresolved = {part.name: scale * part.share * part.interval[1] for part in vague}
         return tuple(
             EventRate(
                 event=name,
                 share=share,
                 rate=rate,
-                parts=whole if len(found) == 1 else {},
+                parts=shares,
+                unresolved=unresolved,
                 traffic=describe_traffic(self.study),
                 calibration=find_calibration(name, self.study),
             )
             for name, share, rate in found
-            if rate is not None
         )
+
+    def _rate_parts(self, whole: CollisionRate) -> list[tuple[str, float, CollisionRate]]:
+        """Return name, share and rate of each stratum; none is above the upper end of the whole."""
+        assert whole.interval is not None  # `_rate_of` gives it
+        found = []
+        for part, error in zip(self.estimate.parts, list_part_errors(self.estimate), strict=True):
+            ends = part.share * part.interval[0], part.share * part.interval[1]
+            rate = self._rate_of(part.share * part.p, part.cov, ends, error, whole.interval[1])
+            assert rate is not None  # as there is one of the whole
+            found.append((part.name, part.share, rate))
+        return found
 
     @cached_property
     def injury_rate(self) -> CollisionRate | None:
-        """Serious injuries (MAIS 3 or more) per hour and per km; None where there is no rate, or no collision."""
+        """Serious injuries (MAIS 3 or more) per million km; None where there is no rate, or no collision."""
         severity = self.kinds.severity
         if severity is None:
             return None
@@ -374,21 +383,23 @@ class Report:
         """Return the rate of what has a value per event, at most that of the whole: with its base's interval if any."""
         if self.no_rate:
             return None
-        known, spread = value > 0 and math.isfinite(cov), {}
-        ends, upper, determined = sampling if known else None, sampling[1], known
-        if known and uncertainty is not None and math.isfinite(uncertainty.spread):
+        (low, high), fold, base_sd = sampling, 1.0, 0.0
+        if not (value > 0 and math.isfinite(cov)):
+            low, cov = 0.0, 0.0
+        elif uncertainty is not None and math.isfinite(uncertainty.spread):
             quantile = refit_quantile(uncertainty.confidence, len(uncertainty.value_refits) - 1, uncertainty.clusters)
-            spread = {"spread": uncertainty.spread, "fit_bias": FIT_BIAS, "quantile": quantile}
-            ends, determined = uncertainty.interval, uncertainty.bound is None
-            upper = upper if uncertainty.bound is None else uncertainty.bound
+            fold = quantile / normal_quantile(self.estimate.confidence)
+            base_sd = fold * math.hypot(uncertainty.spread, FIT_BIAS)
+            low, high = uncertainty.interval or (0.0, high if uncertainty.bound is None else uncertainty.bound)
         base = self.study.fitted
         data = "" if base is None else read_source(base.record)["data"]  # rates of bases of the same events say so
         return CollisionRate(
             scenario=self.study.problem.world.scenario.name,
-            probability=CollisionProbability(
-                p=value, cov=cov, upper=min(upper, most), interval=ends, determined=determined, **spread
-            ),
             frequency=find_frequency(self.study),
+            p=value,
+            sampling_log_sd=fold * cov,
+            base_log_sd=base_sd,
+            interval=(min(low, most), min(high, most)),
             confidence=self.estimate.confidence,
             fitted_to=f"{base.fitted_to}, {data}" if base is not None and data else "",
         )

@@ -1,4 +1,4 @@
-"""Risk: collisions of an ego per hour and per million km over scenarios that count nothing twice."""
+"""Risk: collisions of an ego per million km over scenarios that count nothing twice."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class ScenarioRisk:
     report: Report
     """Its evaluation."""
     rate: exposure.CollisionRate
-    """Its collisions per hour and per km."""
+    """Its collisions per million km."""
     site_factors: Mapping[str, float]
     """Rates under the bases of other sites over that under its own, by name, as far as they are known."""
 
@@ -137,7 +137,7 @@ class ScenarioRisk:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Risk:
-    """Collisions of an ego per hour and per million km, with what their uncertainty comes from."""
+    """Collisions of an ego per million km, with what their uncertainty comes from."""
 
     ego: str
     """The ego, as it was named."""

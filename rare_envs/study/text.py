@@ -61,9 +61,11 @@ def format_rate(value: float) -> str:
 
 
 def format_with_interval(value: float, interval: exposure.RateInterval, unit: str = "", level: str = "") -> str:
-    """Return a rate with its interval, or what it is below, all numbers in one form."""
+    """Return a rate with its interval, all numbers in one form, or with what it is below."""
+    if interval[0] <= 0:  # with an upper end alone the value may be smaller by any power
+        return f"{format_rate(value)}{unit} ({level}below {format_rate(interval[1])})"
     middle, low, high = format_alike(value, *interval)
-    return f"{middle}{unit} ({level}{f'{low} to' if interval[0] > 0 else 'below'} {high})"
+    return f"{middle}{unit} ({level}{low} to {high})"
 
 
 def format_share(share: float) -> str:
@@ -92,8 +94,9 @@ def describe_people(counted: people.HumanBenchmark | None) -> str:
 
 def describe_model(each: EventRate) -> str:
     """Return what the human driver model and its bracket score per million km, and by what factor they miss people."""
-    scores = [found[0] for found in map(each.model_interval, (MODEL, BRACKET)) if found is not None]
-    return ": ".join(filter(None, (" to ".join(dict.fromkeys(format_alike(*scores))), each.uncalibrated)))
+    known = each.calibration
+    scores = format_alike(*(known.per_million_km(name).p for name in (MODEL, BRACKET))) if known is not None else []
+    return ": ".join(filter(None, (" to ".join(dict.fromkeys(scores)), each.uncalibrated)))
 
 
 def list_uncalibrated(events: Sequence[EventRate]) -> str:
@@ -101,10 +104,15 @@ def list_uncalibrated(events: Sequence[EventRate]) -> str:
     return ", ".join(EVENT_NOUNS.get(each.event, each.event) for each in events if each.uncalibrated)
 
 
-def describe_parts(shares: Mapping[str, float]) -> str:
-    """Return the shares of strata in a rate or in p, the largest first: "of which unseen 92 %, looked 8 %"."""
+def describe_parts(shares: Mapping[str, float], unresolved: Mapping[str, float]) -> str:
+    """Return the shares of strata in a rate, the largest first, and the upper ends of those that are not resolved.
+
+    "of which unseen 92 %, looked 8 %", or "of which unseen 100 %; looked is not resolved, below 2.6".
+    """
     ordered = sorted(shares.items(), key=lambda part: -part[1])
-    return f"of which {', '.join(f'{name} {format_share(share)}' for name, share in ordered)}" if shares else ""
+    known = ", ".join(f"{name} {format_share(share)}" for name, share in ordered if name not in unresolved)
+    vague = [f"{name} is not resolved, below {format_rate(high)}" for name, high in unresolved.items()]
+    return "; ".join([*([f"of which {known}"] if known else []), *vague])
 
 
 def tabulate(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -124,7 +132,7 @@ def tabulate_events(events: Sequence[EventRate]) -> list[str]:
         name = EVENT_NOUNS.get(each.event, each.event)
         rows.append((name, *numbers, ego, describe_people(each.people), describe_model(each)))
     head, *lines = tabulate(rows)
-    parts = ([f"  {describe_parts(each.parts)}"] if each.parts else [] for each in events)
+    parts = ([f"  {more}"] if (more := describe_parts(each.parts, each.unresolved)) else [] for each in events)
     return [head, *(line for row, more in zip(lines, parts, strict=True) for line in (row, *more))]
 
 
@@ -289,7 +297,6 @@ def _list_rates(report: Report, details: bool) -> Iterator[Row]:
     yield "collisions", per_km
     yield from (("", line) for line in tabulate_events(report.events))
     if details:
-        yield "", format_with_interval(rate.per_hour, rate.interval_per_hour, " per hour")
         shares = sorted(rate.shares.items(), key=lambda part: -part[1])
         parts = ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in shares if share > 0)
         events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"

@@ -257,7 +257,7 @@ def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     text = " ".join(cli(*BRAKE, "--base", base, "--details").stdout.split())
     assert "from 0.19 brakings per km; the uncertainty is" in text
     data = json.loads(cli(*BRAKE, "--base", base, "--json").stdout)
-    assert data["rate"]["per_hour"] == pytest.approx(42 / 5.64 * data["p"])
+    assert data["rate"]["per_million_km"] == pytest.approx(1e6 * 42 / 218 * data["p"])
 
 
 def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) -> None:
