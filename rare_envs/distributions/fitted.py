@@ -19,9 +19,9 @@ from rare_envs.distributions.mixture import (
     name_kinds,
     pool_mixtures,
 )
-from rare_envs.distributions.product import ProductDistribution
+from rare_envs.distributions.product import ProductDistribution, box_of
 from rare_envs.distributions.space import Distribution, DistributionParameter
-from rare_envs.distributions.stratified import StratifiedDistribution, Stratum, read_part, write_part
+from rare_envs.distributions.stratified import CutNormals, StratifiedDistribution, Stratum, read_part, write_part
 
 FileDistribution = TruncatedGaussianMixture | BetaDistribution | ProductDistribution | StratifiedDistribution
 FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
@@ -266,8 +266,14 @@ def _pool(refits: Sequence[Any]) -> Distribution:
         return pool_mixtures(refits)
     columns = zip(*(each.blocks for each in refits), strict=True)
     return ProductDistribution(
-        tuple(own[0] if all(block is own[0] for block in own) else _pool(own) for own in columns)
+        tuple(own[0] if all(_is_same(block, own[0]) for block in own) else _pool(own) for own in columns)
     )
+
+
+def _is_same(block: Any, other: Any) -> bool:
+    """Return whether blocks are one distribution: the same object, or normals with the same ends."""
+    both = isinstance(block, CutNormals) and isinstance(other, CutNormals)
+    return block is other or (both and all(map(np.array_equal, box_of(block), box_of(other))))
 
 
 def join_independent(*distributions: Distribution) -> Distribution:

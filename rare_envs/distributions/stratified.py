@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr, ndtri_exp
 
 from rare_envs.distributions.acceptance import AcceptedGaps
-from rare_envs.distributions.coordinates import FloatArray, freeze_arrays
+from rare_envs.distributions.coordinates import FloatArray, freeze_arrays, move_inside
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution, box_of
 from rare_envs.distributions.space import RELATIVE_CHANGE, Distribution, DistributionParameter, check_values
@@ -65,8 +65,8 @@ class CutNormals:
         return np.where(inside, density - log_interval(self.low[cut], self.high[cut]).sum(), -np.inf)
 
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
-        """Map to standard normal space, (n, d) -> (n, d), from the nearer tail."""
-        u, cut = np.clip(np.asarray(x, dtype=np.float64), self.low, self.high), self._cut
+        """Map to standard normal space, (n, d) -> (n, d), from the nearer tail; an end is taken one float inside."""
+        u, cut = move_inside(np.asarray(x, dtype=np.float64), self.low, self.high), self._cut
         low, z, high = self.low[cut], u[:, cut], self.high[cut]
         u[:, cut] = normal_of_tails(log_interval(low, z), log_interval(z, high))
         return u

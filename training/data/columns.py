@@ -98,7 +98,9 @@ def read_header(path: Path) -> list[str]:
     try:
         with path.open(encoding="utf-8-sig") as file:
             header = [name.strip().strip('"') for name in file.readline().split(",")]
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise ValueError(f"Cannot read {path}: it is no text, and CSV or text was expected.") from None
+    except OSError as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
     if header == [""]:
         raise ValueError(f"{path} is empty.")
@@ -150,8 +152,9 @@ def _read_csv(path: Path, size: int, columns: ColumnMap) -> pa.Table:
 def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None, size: int = 18) -> Rows:
     """Return columns, by their places, of a matrix (rows, size), or of text that holds one."""
     if matrix is None:
+        delimiter = "," if len(read_header(path)) > 1 else None
         try:
-            matrix = np.loadtxt(path, ndmin=2, delimiter="," if len(read_header(path)) > 1 else None)
+            matrix = np.loadtxt(path, ndmin=2, delimiter=delimiter)
         except (OSError, ValueError) as error:
             raise ValueError(f"Cannot read {path}: {error}") from None
     if matrix.shape[1] != size:

@@ -34,7 +34,7 @@ from training.fit.mixture import (
     SMALLEST_COMPONENT,
 )
 from training.fit.refits import FOLD_STARTS, Asked, Fit
-from training.fit.strata import Neighbours, fit_cut_in, fit_hard_brake
+from training.fit.strata import Neighbours, fit_cut_in, fit_hard_brake, keep_strata
 
 SETTINGS = {
     "covariance_floor": COVARIANCE_FLOOR,
@@ -90,6 +90,7 @@ def fit_base(
     """
     asked = Asked(n_refits, seed, report)
     if scenario_named(scenario).name == "hard_brake":
+        events = keep_strata(events)
         fit = fit_hard_brake(scenario, events, asked)
     elif neighbours is not None:
         fit = fit_cut_in(scenario, events, neighbours, frequency, asked)

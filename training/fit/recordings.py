@@ -58,6 +58,7 @@ from training.fit.strata import (
     check_starts,
     find_neighbours,
     keep_neighbours,
+    keep_strata,
 )
 
 COMMAND = "rare-envs fit, with --highd or another option of recordings"
@@ -67,7 +68,7 @@ EXTRACTORS = {
     "hard_brake": hard_brake_events,
 }
 """Functions that extract the events of a scenario."""
-CUT_IN = "cut_in"
+CUT_IN, HARD_BRAKE = "cut_in", "hard_brake"
 LEAST_NEIGHBOURS = 500
 """Neighbours at random times that a recording of whole traffic has in its first minute."""
 TICKS_PER_SECOND = 10
@@ -184,13 +185,17 @@ def fit_own_bases(
     for scenario in chosen:
         path, recipe = out / f"{scenario}_events.csv", EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, recorded_parameters(scenario))
-        frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
         asked: dict[str, Any] = {"n_refits": n_refits, "seed": seed, "report": partial(tell, scenario)}
         tell(scenario, f"{len(events.joint):,} events; fitting")
         try:
             if scenario == CUT_IN:
                 check_starts(events)
                 asked["neighbours"] = _choose_neighbours(beside)
+            elif scenario == HARD_BRAKE:
+                found, events = len(events.joint), keep_strata(events)
+                if len(events.joint) < found:
+                    typer.echo(f"{scenario}: {found - len(events.joint)} left out: {events.log[-2]['rule']}", err=True)
+            frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
             base = fit_base(scenario, events, source, COMMAND, frequency=frequency, **asked)
         except ValueError as error:
             too_few += 1

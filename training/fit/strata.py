@@ -45,7 +45,7 @@ from training.fit.checks import (
     check_states,
 )
 from training.fit.coordinates import COORDINATE_SYSTEMS, CoordinateSystem, SystemFit, fit_system
-from training.fit.filters import EventSet, recorded_parameters
+from training.fit.filters import EventSet, drop_events, recorded_parameters
 from training.fit.mixture import COVARIANCE_FLOOR, append_independent, select_mixture
 from training.fit.refits import FOLD_STARTS, Asked, Fit, draw_events
 
@@ -327,17 +327,29 @@ def _split_brakings(events: EventSet, parameters: Sequence[Parameter]) -> list[_
     return [_Brakings("slowing", slowing, others, narrow), _Brakings("stop", stop, systems, parameters[:3])]
 
 
+def keep_strata(events: EventSet) -> EventSet:
+    """Return brakings without those of a stratum of too few, and what that dropped; a ValueError if none are left."""
+    stops = events.joint[:, 3] > events.joint[:, 0] - LEAST_KEPT
+    enough = [(stops == which).sum() >= LEAST_BRAKINGS for which in (False, True)]
+    keep = np.where(stops, enough[1], enough[0])
+    if not keep.any():
+        raise ValueError(f"{len(events.joint)} events are too few; {LEAST_BRAKINGS} of a stratum are needed.")
+    if keep.all():
+        return events
+    rule = f"brakings {'to a standstill' if enough[1] else 'that leave some speed'} alone"
+    log = drop_events(np.full(len(keep), True), [(rule, f"fewer than {LEAST_BRAKINGS} are no stratum", keep)])
+    return replace(events, joint=events.joint[keep], clusters=events.clusters[keep], log=(*events.log, *log))
+
+
 def fit_hard_brake(scenario: str, events: EventSet, asked: Asked) -> Fit:
     """Return brakings of `HardBrake-v0` with both strata, of events with speed, gap, peak and loss, (n, 4).
 
-    The loss of a braking to a standstill is the speed. A stratum of too few brakings is left out; a ValueError if both
-    are.
+    The loss of a braking to a standstill is the speed. Of a stratum of too few brakings there are none, see
+    `keep_strata`.
     """
     parameters = tuple(scenario_named(scenario).parameters)
     split = _split_brakings(events, parameters)
-    kept = [each.name for each in split if len(each.events.joint) >= LEAST_BRAKINGS]
-    if not kept:
-        raise ValueError(f"{len(events.joint)} events are too few; {LEAST_BRAKINGS} of a stratum are needed.")
+    kept = [each.name for each in split if len(each.events.joint)]
 
     def fit(drawn: EventSet, starts: int | None) -> tuple[StratifiedDistribution, list[SystemFit]] | None:
         parts = [each for each in _split_brakings(drawn, parameters) if each.name in kept]

@@ -238,6 +238,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
     """Return titles and texts of the lines of one base; empty texts where nothing is known."""
     fit = {"BIC {:,.1f}": base["bic"], "held-out log likelihood {:.2f} per event": base["held_out_log_prob"]}
     family, coordinates = base["family"] or "", base["coordinates"] or ""
+    told = all(part.rpartition(": ")[2] in family for part in coordinates.split("; "))  # of strata each by itself
     checks = describe_checks(base["checks"])
     counted, known = f"not known, no rate per hour or km: {base['no_frequency']}", base["frequency"]
     if known is not None:
@@ -249,7 +250,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "site": ", ".join(filter(None, (base["site"], base["date"]))),
         "data": base["data"] or "",
         "licence": base["licence"] or "",
-        "family": family if coordinates in family else ", ".join(filter(None, (family, coordinates))),
+        "family": family if told else ", ".join(filter(None, (family, coordinates))),
         "fit": ", ".join(text.format(value) for text, value in fit.items() if value is not None),
         "frequency": counted,
         "counted in": (known or {}).get("source", ""),

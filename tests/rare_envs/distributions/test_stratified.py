@@ -17,6 +17,8 @@ from rare_envs.distributions import (
     join_independent,
 )
 from rare_envs.distributions.acceptance import log_acceptance, needed_after
+from rare_envs.scenarios.base import load_base
+from rare_envs.scenarios.registry import scenario_named
 
 LIMIT = -3.6334
 NAMES = ("ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap")
@@ -147,3 +149,14 @@ def test_parameters_of_strata_are_shares_and_those_of_the_parts() -> None:
     values[0], values[-1] = 2.8e-4, 1.0
     changed = both.with_parameters(values)
     assert (changed.strata[0].share, changed.strata[1].base.blocks[0].limit) == (2.8e-4, 1.0)
+
+
+def test_normals_of_a_file_are_the_same_block_in_all_refits_and_their_ends_have_an_image() -> None:
+    base = load_base(scenario_named("rare_envs/CutIn-v1"), "us101-test")
+    pool = base.covering_ensemble()
+    x = pool.sample(200, np.random.default_rng(0))
+    mean = np.mean([np.exp(each.log_prob(x)) for each in base.refits], axis=0)
+    assert np.exp(pool.log_prob(x)) == pytest.approx(mean, rel=0.05)  # but for what the box cuts away
+    assert pool.blocks[1] is base.refits[0].blocks[1]
+    u = CutNormals([-np.inf, LIMIT], [LIMIT, 2.0]).to_standard_normal([[LIMIT, LIMIT], [LIMIT, 2.0]])
+    assert np.isfinite(u).all() and (np.abs(u) > 7.0).all()

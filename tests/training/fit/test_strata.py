@@ -5,7 +5,9 @@ import pytest
 
 from rare_envs.distributions.acceptance import log_acceptance
 from training.fit.acceptance import fit_pair, profile_limit
-from training.fit.strata import UNSEEN_LOG_SD, find_neighbours, share_unseen
+from training.fit.base import fit_base
+from training.fit.filters import EventSet
+from training.fit.strata import UNSEEN_LOG_SD, find_neighbours, keep_strata, share_unseen
 
 
 def test_what_drivers_accept_is_found_again() -> None:
@@ -35,3 +37,21 @@ def test_the_share_who_do_not_look_is_that_of_44_events() -> None:
     assert share_unseen(0.26, 0.321) == pytest.approx(1 / 6100, rel=0.01)
     assert share_unseen(0.52, 0.321) == pytest.approx(share_unseen(0.26, 0.321) / 2.0)
     assert np.exp(1.96 * UNSEEN_LOG_SD) == pytest.approx(4.3, abs=0.1)
+
+
+@pytest.mark.parametrize(("stops", "left"), [(7, ["slowing"]), (53, ["stop"]), (30, ["slowing", "stop"])])
+def test_a_stratum_of_too_few_brakings_is_left_out_of_all(quick, stops: int, left: list[str]) -> None:
+    """Of 60 brakings, some to a standstill: refits have the strata of the fit, and the events are those of these."""
+    rng = np.random.default_rng(0)
+    speed, loss = rng.uniform(12.0, 20.0, 60), rng.uniform(4.0, 9.0, 60)
+    loss[:stops] = speed[:stops]
+    rows = np.column_stack([speed, rng.lognormal(2.5, 0.4, 60), rng.lognormal(0.7, 0.3, 60), loss])
+    base = fit_base("hard_brake", EventSet(rows, np.arange(60)), {}, "a test", n_refits=8)
+    assert [[each.name for each in one.strata] for one in (base, *base.refits)] == [left] * 9
+    assert base.events.used == ({7: 53, 53: 53, 30: 60}[stops],)
+
+
+def test_too_few_of_both_strata_are_none() -> None:
+    rows = np.column_stack([np.full(18, 15.0), np.full(18, 10.0), np.full(18, 2.0), np.repeat([15.0, 5.0], 9)])
+    with pytest.raises(ValueError, match="18 events are too few; 10 of a stratum are needed"):
+        keep_strata(EventSet(rows, np.arange(18)))
