@@ -34,8 +34,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, choose_method, offer_of
-from samplers.plain_draws import PlainDraws
+from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Stepping, Steps, choose_method, offer_of
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     NOT_KNOWN,

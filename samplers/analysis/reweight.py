@@ -263,9 +263,10 @@ class RefitSums(NamedTuple):
     """Effective number of failing points behind it, shape (m, R); a path of a Markov chain counts as one."""
 
 
-def find_fitted_base(base: object) -> FittedBase | None:
-    """Return the base if it has refits; None for any other."""
-    return base if isinstance(base, FittedBase) and len(base.refits) > 0 else None
+def find_fitted_base(base: Any) -> FittedBase | None:
+    """Return the base if it has refits; None for any other. Names are looked up: `isinstance` would compute values."""
+    fitted = {"refits", "clusters", "fitted_to", "family"} <= {*dir(base)}
+    return base if fitted and len(base.refits) > 0 else None
 
 
 _checked: WeakKeyDictionary[object, tuple[object, ...]] = WeakKeyDictionary()
