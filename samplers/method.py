@@ -1,4 +1,4 @@
-"""Contract of a method (`Stepping`), its goal and outcome, what a whole run has found; and plain draws, the simplest."""
+"""Contract of a method (`Stepping`), its goal and outcome, what a whole run has found; the simplest: plain draws."""
 
 import math
 import sys
