@@ -45,7 +45,7 @@ class EventRate:
     parts: Mapping[str, float]
     """Shares of the rate by stratum; empty where there is one stratum, or nothing failed."""
     unresolved: Mapping[str, float] = field(default_factory=dict)
-    """Upper ends of the rate [per million km] in strata whose simulations met no failure, or hardly any."""
+    """Upper ends of the rate [per million km] in strata that are not resolved, see `samplers.method.Part`."""
     traffic: str
     """The base distribution, and the options that make other traffic of it."""
     calibration: EventCalibration | None

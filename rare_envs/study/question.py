@@ -40,6 +40,7 @@ from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.world import drive
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, read_question
 from rare_envs.study.run_folder import STUDY, LoadedStudy
+from samplers.problem import read_strata
 
 MAX_NOTES = 2**24
 """Bytes of the notes that are read, the last ones: 250,000 runs."""
@@ -195,6 +196,8 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
             if not isinstance(base, FittedDistribution) or not base.refits:
                 name = "the default" if question.base is None else repr(question.base)
                 raise ValueError(f"The base distribution ({name}) has no refits, so there is no ensemble of them.")
+            if read_strata(base):
+                raise ValueError("The base distribution has strata, whose refits have no ensemble.")
             base = base.ensemble()
         world = {name: getattr(question, name) for name in PROBLEM_FIELDS}
         return DrivingProblem(question.env_id, ego=ego, base=base, **world)

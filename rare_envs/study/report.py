@@ -28,7 +28,6 @@ from samplers.analysis.gate import Decision
 from samplers.analysis.reweight import refit_quantile
 from samplers.analysis.weighted import Reported
 from samplers.evaluate import Fault
-from samplers.replicate import UNINFORMATIVE_COV
 from samplers.sample import Interval
 
 MOST_DIFFERING = 0.05
@@ -337,7 +336,7 @@ class Report:
         found = self._rate_parts(whole) if apart else [(whole.scenario, 1.0, whole)]
         shares = {} if apart or not self.estimate.p else {part.name: part.of_sum for part in parts}
         scale = MILLION_KM * whole.frequency.per_km
-        vague = () if apart else (part for part in parts if part.p == 0 or part.cov >= UNINFORMATIVE_COV)
+        vague = () if apart else (part for part in parts if not part.resolved)
         unresolved = {part.name: scale * part.share * part.interval[1] for part in vague}
         return tuple(
             EventRate(

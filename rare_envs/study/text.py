@@ -126,8 +126,8 @@ def tabulate_events(events: Sequence[EventRate]) -> list[str]:
     rows = [("", "per km", "per event", "per million km", "people in them", "human model")]
     for each in events:
         rate = each.rate
-        p = rate.per_million_km / exposure.MILLION_KM / rate.frequency.per_km / each.share
-        numbers = format_rate(rate.frequency.per_km * each.share), f"{p:.1e}"
+        high = "" if rate.determined or rate.interval is None else f"below {rate.interval[1] / each.share:.1e}"
+        numbers = format_rate(rate.frequency.per_km * each.share), high or f"{rate.p / each.share:.1e}"
         ego = format_with_interval(rate.per_million_km, rate.interval_per_million_km)
         name = EVENT_NOUNS.get(each.event, each.event)
         rows.append((name, *numbers, ego, describe_people(each.people), describe_model(each)))
@@ -177,15 +177,17 @@ def format_probability(p: float | None, like: float | None = None) -> str:
     if p <= 0:
         return "0"
     if (p if like is None else like) >= 0.001:
-        return f"{100 * p:.2g} %"
+        return f"{100 * p:.{2 if p < 0.99 else 4}g} %"
     mantissa, _, exponent = f"{p:.1e}".partition("e")
     return f"{mantissa} × 10{str(int(exponent)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
 
 
-def explain_no_gain(p: float) -> str:
-    """Return why there is no gain over Monte Carlo."""
+def explain_no_gain(p: float, resolved: bool) -> str:
+    """Return why there is no gain over Monte Carlo; of sums whether all strata are resolved."""
     if p <= 0:
         return "not known, as nothing that failed counts in p"
+    if not resolved:
+        return "not known, as a stratum is not resolved"
     return "none, as every scenario fails" if p >= 1 else "not known, as the c.o.v. is 1 or more"
 
 
@@ -312,7 +314,7 @@ def _list_effort(report: Report, details: bool) -> Iterator[Row]:
     """Yield the coefficient of variation, the method, and what the run took."""
     estimate, question = report.estimate, report.study.question
     cov = "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"
-    gain = explain_no_gain(estimate.p)
+    gain = explain_no_gain(estimate.p, all(part.resolved for part in estimate.parts))
     if not math.isnan(estimate.gain):
         size = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
         needed = estimate.gain * estimate.n_sim

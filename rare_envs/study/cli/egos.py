@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder
 from rare_envs.study.cli import shell
 from rare_envs.study.cli.shell import Answer, command
@@ -96,13 +97,17 @@ def train_ego_command(
         world["action"] = "discrete"  # which is what the algorithm made of it
     told = {**world, "noise": next(word for word, argument in shell.NOISE.items() if argument == world["noise"])}
     told |= {"weather": None, "seed": None if plan is None else plan.next_seed}
-    options = [
-        f"--{name} {shlex.quote(str(each))}" for name, each in told.items() if each not in (None, USUAL.get(name))
-    ]
-    ego = shlex.quote(str(path))
-    asks = ["rare-envs estimate", *ids, "--ego", ego] if len(ids) == 1 else ["rare-envs risk", ego]
-    words = " ".join([*asks, *options])
-    return Answer(data, f"Saved {path}. Next: {words}{' --weather' if world['weather'] else ''}")
+    options, ego = {name: each for name, each in told.items() if each not in (None, USUAL.get(name))}, str(path)
+    if len(ids) == 1:
+        words = ["estimate", *ids, "--ego", ego, *(word for name in options for word in (f"--{name}", options[name]))]
+        words += ["--weather"] if world["weather"] else []
+    else:  # which has a base for each scenario, and none of the other options
+        words = ["risk", ego]
+        for name in sorted({"observation", "action"} & {*options}):
+            words += [f"--{name}", options[name]]
+        names = (find_scenario(env_id).name for env_id in ids) if "base" in options else ()
+        words += [word for name in names for word in ("--base", f"{name}={options['base']}")]
+    return Answer(data, f"Saved {path}. Next: rare-envs {shlex.join(map(str, words))}")
 
 
 def _read_environments(names: Sequence[str]) -> tuple[str, ...]:

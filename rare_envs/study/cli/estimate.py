@@ -90,6 +90,11 @@ def refuse_without_limit(typed: set[str], limits: str) -> None:
             raise BadInput(f"Expected {option} together with {limits}, the limit.")
 
 
+def _split_words(*texts: str) -> list[str]:
+    """Return the words of texts in which commas stand between words."""
+    return [word.strip() for text in texts for word in text.split(",") if word.strip()]
+
+
 def format_seconds(seconds: float) -> str:
     """Return a time in a unit of its size."""
     if seconds < 7200.0:
@@ -203,7 +208,7 @@ def plan_command(
             find_scenario(target)
         except ValueError as error:
             raise BadInput(f"There is no folder {target!r} of a run. {error}") from error
-        methods = [name.strip() for name in asked.pop("method").split(",")]
+        methods = _split_words(asked.pop("method"))
         question = Question(env_id=target, ego=ego, max_sim=pilot, **asked)
         found = plan_by_pilots(question, methods, cov, progress=True)
     lines = [f"For a c.o.v. of {cov:g} (--target-cov {cov:g}):"]
@@ -223,7 +228,8 @@ def risk_command(
     asked: dict[str, Any],
     typed: set[str],
     scenario: Annotated[
-        list[str] | None, Option(help="Scenario of the sum; may be repeated.", show_default="cut_in and hard_brake")
+        list[str] | None,
+        Option(help="Scenario of the sum; several with commas.", show_default="cut_in and hard_brake"),
     ] = None,
     sites: Annotated[
         str,
@@ -251,8 +257,8 @@ def risk_command(
     with as_bad_input(ValueError):
         found = risk(
             ego,
-            scenarios=scenario or SCENARIO_SET,
-            sites=[site.strip() for site in sites.split(",") if site.strip()],
+            scenarios=_split_words(*scenario or ()) or SCENARIO_SET,
+            sites=_split_words(sites),
             bases=bases,
             out=out,
             progress=True,

@@ -139,8 +139,8 @@ def draw_parameters(
         if j >= len(labels):
             axes.set_axis_off()
             continue
-        both = np.concatenate([ordinary[:, j], failing[:, j]])
-        low, high = (float(end) for end in np.quantile(both, [0.002, 0.998]))
+        ends = np.quantile(ordinary[:, j], [0.002, 0.998]), np.quantile(failing[:, j], [0.002, 0.998])
+        low, high = float(np.min(ends)), float(np.max(ends))
         bins = np.linspace(low, high, 30) if high > low else np.array([low - 0.5, low + 0.5])
         usual: dict[str, Any] = {"color": ORDINARY_COLOUR, "label": "ordinary traffic"}
         failures: dict[str, Any] = {"color": HIT_COLOUR, "label": "failures", "histtype": "step", "linewidth": 1.5}

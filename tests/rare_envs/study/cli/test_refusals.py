@@ -70,6 +70,8 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     (("risk", "idm", "--confidence", 0.9), ("Expected --confidence together with --max-rate",)),
     ((*RISK[:1], "imd", *RISK[2:]), ("idm",)),
     ((*RISK, "--scenario", "merge"), ("Unknown scenario 'merge'", "cut_in")),
+    (("risk", "idm", "--scenario", "highway"), ("No base of highway is of a site",)),
+    ((*RISK, "--scenario", "cut_in,car_following"), ("would count twice",)),
     ((*RISK, "--base", "hard_brake=mine.json"), ("several for 'hard_brake'",)),
     ((*RISK, "--sites", "us101-test"), ("no site", "'us101'", "cut_in=us101-test")),
     (("risk", "idm", "--base", "cut_in=broken.json"), ("broken.json", "JSON")),
