@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import elementwise
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.mixture import TruncatedGaussianMixture, Walk
 from rare_envs.distributions.space import RELATIVE_CHANGE, DistributionParameter
+from rare_envs.distributions.truncated_normal import solve_rising
 
 ANSWER_TIME = 1.0
 """T, after which the vehicle behind brakes [s]. Assumed."""
@@ -340,25 +340,15 @@ class _Gaps:
         panel = np.where(turned, GAP_PANELS - 1 - place, place)
         low, high = self.edges[rows, panel], self.edges[rows, panel + 1]
 
-        def error(y: FloatArray, which: FloatArray) -> FloatArray:
-            i = which.astype(np.intp)
+        def find(y: FloatArray, i: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
             left, right = np.where(turned[i], y, low[i]), np.where(turned[i], high[i], y)
-            mass = before[i] + self.integrate(left, right, i)
-            sign = np.where(turned[i], -1.0, 1.0)
-            return np.asarray(sign * np.log(np.maximum(mass, TINY) / wanted[i]))
+            mass, sign = np.maximum(before[i] + self.integrate(left, right, i), TINY), np.where(turned[i], -1.0, 1.0)
+            return sign * np.log(mass / wanted[i]), self.density(y, i) / mass
 
-        return _solve(error, low, high)
-
-
-def _solve(error: Any, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return where rising errors of (values, rows) are 0 between ends (n,), or the end where none is."""
-    rows = np.arange(len(low), dtype=np.float64)
-    first, last = error(low, rows), error(high, rows)
-    out = np.where(first >= 0.0, low, high)
-    inner = np.flatnonzero((first < 0.0) & (last > 0.0))
-    if inner.size:
-        out[inner] = elementwise.find_root(error, (low[inner], high[inner]), args=(rows[inner],)).x
-    return out
+        share = (wanted - before) / np.maximum(parts[rows, place], TINY)
+        return solve_rising(
+            find, low + (high - low) * np.clip(np.where(turned, 1.0 - share, share), 0.0, 1.0), low, high
+        )
 
 
 def _normal_of(lower: FloatArray, upper: FloatArray) -> FloatArray:
@@ -443,8 +433,13 @@ class _Closing(NamedTuple):
         wanted = np.maximum(upper, TINY)
         panel = np.clip(len(self.edges) - 1 - np.searchsorted(self.beyond[::-1], wanted), 0, len(self.edges) - 2)
 
-        def error(closing: FloatArray, which: FloatArray) -> FloatArray:
-            i = which.astype(np.intp)
-            return np.asarray(np.log(wanted[i] / np.maximum(self._mass_above(closing, panel[i]), TINY)))
+        low, high = self.edges[panel], self.edges[panel + 1]
 
-        return _solve(error, self.edges[panel], self.edges[panel + 1])
+        def find(closing: FloatArray, i: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+            mass = np.maximum(self._mass_above(closing, panel[i]), TINY)
+            t = (2.0 * closing - low[i] - high[i]) / (high[i] - low[i])
+            density = (legendre.legvander(t, len(NODES) - 1) * self.density[:, panel[i]].T).sum(axis=1)
+            return np.log(wanted[i] / mass), density / mass
+
+        share = (wanted - self.beyond[panel + 1]) / np.maximum(self.beyond[panel] - self.beyond[panel + 1], TINY)
+        return solve_rising(find, high - (high - low) * np.clip(share, 0.0, 1.0), low, high)

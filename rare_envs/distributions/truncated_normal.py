@@ -8,6 +8,7 @@ found by Newton's method on the scale of the standard normal, where the map is n
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, cast
@@ -25,10 +26,9 @@ small as the cancellation in a difference of distribution functions, 1e-12."""
 NEAR_END = 0.1
 """Quantiles less than this over (1 + |a|) from an end of the interval are first looked for along a constant density."""
 LAST_ERROR = 1e-7
-"""On the scale of the standard normal, over 1 + |u|: a step of Newton's method from there, which leaves its square, is
-the last."""
+"""On the scale of the standard normal: a step of Newton's method from there, which leaves its square, is the last."""
 MOST_STEPS = 200
-"""Nearly all points take two or three; brackets are halved where Newton's method leaves them."""
+"""Of Newton's method; nearly all points take two or three."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +65,11 @@ class TruncatedConditional:
         """Invert `to_normal`, (n,) -> (n,)."""
         with np.errstate(all="ignore"):  # the ends of the interval, and components without weight, give inf and nan
             total = np.broadcast_to(self.log_whole_mass(), u.shape)
-            low, high = (np.full(len(u), end, dtype=np.float64) for end in (self.low, self.high))
-            x = self._guess(u, total)
-            own, rest, out = self, np.arange(len(u)), x.copy()
-            for _ in range(MOST_STEPS):
-                error, slope = own._find_error(x, u, total)
-                low, high = np.where(error <= 0.0, x, low), np.where(error >= 0.0, x, high)
-                target = x - error / slope
-                target = np.where((target >= low) & (target <= high), target, 0.5 * (low + high))
-                out[rest] = target
-                going = np.flatnonzero(~(np.abs(error) <= LAST_ERROR * (1.0 + np.abs(u))) & (target != x))
-                if not going.size:
-                    break
-                x, u, total, low, high = (each[going] for each in (target, u, total, low, high))
-                own, rest = own.take(going), rest[going]
-        return out
+            return solve_rising(
+                lambda x, rows: (self if len(x) == len(u) else self.take(rows))._find_error(x, u[rows], total[rows]),
+                self._guess(u, total),
+                *(np.full(len(u), end, dtype=np.float64) for end in (self.low, self.high)),
+            )
 
     def draw(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Return draws from uniforms (n,) each, of which the first chooses a component, normal in x."""
@@ -137,6 +127,32 @@ class TruncatedConditional:
         place = (self._place(face) - self.mean) / self.scale
         near = (away * (1.0 + np.abs(place)) < NEAR_END * self.scale).all(axis=0)
         return np.where(near, np.clip(face - np.sign(u) * away, self.low, self.high), middle)
+
+
+def solve_rising(
+    find: Callable[[FloatArray, NDArray[np.intp]], tuple[FloatArray, FloatArray]],
+    x: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+) -> FloatArray:
+    """Return where rising errors are 0 between ends (n,), or the end that is nearer, from a guess.
+
+    `find` returns errors and slopes at x (m,) of some rows (m,). Newton's method; brackets are halved where it leaves
+    them.
+    """
+    out, rows = x.copy(), np.arange(len(x))
+    with np.errstate(all="ignore"):
+        for _ in range(MOST_STEPS):
+            error, slope = find(x, rows)
+            low, high = np.where(error <= 0.0, x, low), np.where(error >= 0.0, x, high)
+            target = x - error / slope
+            target = np.where((target >= low) & (target <= high), target, 0.5 * (low + high))
+            out[rows] = target
+            going = np.flatnonzero(~(np.abs(error) <= LAST_ERROR) & (target != x))
+            if not going.size:
+                break
+            x, low, high, rows = target[going], low[going], high[going], rows[going]
+    return out
 
 
 def _take_rows(value: Any, rows: NDArray[np.intp]) -> Any:
