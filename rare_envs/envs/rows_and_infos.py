@@ -17,6 +17,7 @@ from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.distributions.stratified import StratifiedDistribution
 from rare_envs.multi_agent import view_order
 from rare_envs.simulation.decision import StepResult, advance
 from rare_envs.simulation.episode import Episode
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 ROWS_AHEAD = 256
 """Scenarios that are drawn at once: a few cost as much as these."""
-DRAWS_IN_A_ROW = (TruncatedGaussianMixture, BetaDistribution)
+DRAWS_IN_A_ROW = (TruncatedGaussianMixture, BetaDistribution, StratifiedDistribution)
 """Distributions whose draws of m rows and then of n are those of m + n rows."""
 
 
