@@ -56,7 +56,7 @@ FLOORS = {
     "car_following_ppo_compiled": 700.0,
     "env_step": 20.0,
     "vec_step": 1000.0,
-    "vec_step_cut_in": 1000.0,
+    "vec_step_cut_in": 500.0,
     "adss_latency": 10.0,
     "highway_1": 1.0,
     "highway_64": 30.0,
