@@ -18,7 +18,8 @@ from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.observation import read_kinds
-from rare_envs.simulation.world import Clock, Measurement, Sensing, World, noise_block
+from rare_envs.simulation.settings import Clock, Measurement, Sensing
+from rare_envs.simulation.world import World, noise_block
 
 NO_NEEDS = EgoNeeds()
 CONFIGURATION_ARGUMENTS = {

@@ -45,6 +45,7 @@ from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import read_kinds
+from rare_envs.simulation.settings import Measurement
 from rare_envs.simulation.terms import (
     ROLLOUTS_PER_GRADIENT,
     Differentiator,
@@ -52,7 +53,7 @@ from rare_envs.simulation.terms import (
     find_differentiator,
     simulate_terms,
 )
-from rare_envs.simulation.world import Driver, Measurement, World, rollout
+from rare_envs.simulation.world import Driver, World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 COMPILED_DRAWS = 300_000

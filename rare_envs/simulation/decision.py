@@ -14,7 +14,8 @@ from torch import Tensor
 from rare_envs.control.actions import IDLE, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.devices import constant
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Clock, World
+from rare_envs.simulation.settings import Clock
+from rare_envs.simulation.world import World
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import State, map_leaves
 

@@ -17,7 +17,8 @@ from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.measures.base import Measure, Moment
 from rare_envs.measures.registry import TermTracker, find_order
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Driver, Measurement, World, drive_tick, noise_columns, split_noise
+from rare_envs.simulation.settings import Measurement
+from rare_envs.simulation.world import Driver, World, drive_tick, noise_columns, split_noise
 from rare_envs.traffic.state import map_tensors
 
 GRADIENT_TILE = 256

@@ -28,7 +28,8 @@ from agents import LearnedEgo, Provenance, save_driver
 from rare_envs.control.idm import IDM
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
-from rare_envs.simulation.world import Clock, World, drive
+from rare_envs.simulation.settings import Clock
+from rare_envs.simulation.world import World, drive
 from rare_envs.startup import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from training.command_line import RunFolderOption, report_errors, run_command

@@ -35,7 +35,8 @@ from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.sensors.lidar import SPEED_COLUMN
 from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Clock, Driver, Measurement, Sensing, World, drive
+from rare_envs.simulation.settings import Clock, Measurement, Sensing
+from rare_envs.simulation.world import Driver, World, drive
 from rare_envs.traffic.bodies import lead_index
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.road import ReferenceLine, Road, i80, straight

@@ -23,7 +23,8 @@ from rare_envs.sensors.camera import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTR
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import Background, TrafficBackground, find_drivers
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Clock, Sensing, World
+from rare_envs.simulation.settings import Clock, Sensing
+from rare_envs.simulation.world import World
 from rare_envs.traffic.road import ReferenceLine, Road, i80
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.recipes.ordinary_traffic import OrdinaryDrivers, draw_starts, make_ordinary_traffic

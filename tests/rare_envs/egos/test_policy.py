@@ -14,7 +14,8 @@ from rare_envs.egos.wrappers import WrappedPolicy, find_frame_stacking
 from rare_envs.plugins import EgoGone, NoAnswer, check_predict, refuse_ego
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.observation import observation_space
-from rare_envs.simulation.world import Clock, World
+from rare_envs.simulation.settings import Clock
+from rare_envs.simulation.world import World
 
 WORLD = World(CAR_FOLLOWING)
 X = torch.tensor([[20.0, 15.0, 30.0], [25.0, 15.0, 40.0], [30.0, 15.0, 50.0]])

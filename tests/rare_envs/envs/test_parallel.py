@@ -18,7 +18,8 @@ from rare_envs.envs.parallel import AgentsVectorEnv
 from rare_envs.make import set_up
 from rare_envs.multi_agent import adversary_reward, own_reward, play, start, step_agents, step_traffic
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.world import Clock, World, rollout
+from rare_envs.simulation.settings import Clock
+from rare_envs.simulation.world import World, rollout
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated

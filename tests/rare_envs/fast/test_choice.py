@@ -14,7 +14,7 @@ from rare_envs import IDM
 from rare_envs.fast import rollouts
 from rare_envs.scenarios import car_following
 from rare_envs.scenarios.cut_in import CutterModel
-from rare_envs.simulation.world import Measurement
+from rare_envs.simulation.settings import Measurement
 from rare_envs.traffic.state import State
 
 CAR_FOLLOWING = "rare_envs/CarFollowing-v0"

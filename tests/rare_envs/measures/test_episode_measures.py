@@ -16,7 +16,8 @@ from rare_envs.control.idm import IDM
 from rare_envs.measures import Measure, Moment, Trace, TraceMeasure, minimum, stl, ttc, weighted, with_collision
 from rare_envs.measures.two_dimensional import PET_MAX, pet
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.simulation.world import Measurement, World, drive, rollout
+from rare_envs.simulation.settings import Measurement
+from rare_envs.simulation.world import World, drive, rollout
 from rare_envs.study.replay import drive_again
 from rare_envs.traffic.bodies import lead_of
 from rare_envs.traffic.road import straight

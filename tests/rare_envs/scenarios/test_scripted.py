@@ -11,7 +11,8 @@ from rare_envs import IDM
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_V1, bezier
 from rare_envs.simulation import drive
-from rare_envs.simulation.world import Clock, World
+from rare_envs.simulation.settings import Clock
+from rare_envs.simulation.world import World
 from tests.rare_envs.traffic_states import F64, tensor
 
 

@@ -16,7 +16,8 @@ from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_V1, CutterModel
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation import cuda_graphs
 from rare_envs.simulation.cuda_graphs import RecordedRollouts, is_recordable
-from rare_envs.simulation.world import Clock, Measurement, World, rollout
+from rare_envs.simulation.settings import Clock, Measurement
+from rare_envs.simulation.world import World, rollout
 
 X = torch.tensor([[20.0, 12.0, 12.0, 20.0, 40.0, 3.5], [30.0, 25.0, 9.0, 20.0, 40.0, -3.5]])
 

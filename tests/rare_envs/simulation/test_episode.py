@@ -15,7 +15,8 @@ from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Clock, Measurement, World, rollout
+from rare_envs.simulation.settings import Clock, Measurement
+from rare_envs.simulation.world import World, rollout
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 
