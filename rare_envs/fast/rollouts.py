@@ -160,8 +160,8 @@ def advance(episode: Episode, action: SingleArray, script: ScriptNumbers) -> Ste
     start, rooms = stack_state(old), (np.empty((n, len(f)), dtype=np.float32) for n in (2, 6, count_features(vehicles)))
     table, stepped, tensor = make_table(start, vehicles, len(f)), Stepped(f.copy(), *rooms), torch.from_numpy
     eventful = step(table, vehicles, action, script, stepped)
-    fields = (tensor(field.T) for field in table[: 4 * vehicles].reshape(4, vehicles, len(f)))
-    state = State(*fields, theta=tensor(table[4 * vehicles : len(start)].T))
+    fields = (*table[: 4 * vehicles].reshape(4, vehicles, len(f)), table[4 * vehicles : len(start)])
+    state = State(*(tensor(field.T) for field in fields))
     lead, now, least = Lead(*map(tensor, stepped.lead)), tensor(stepped.f == COLLISION), tensor(stepped.f)
     statistics = episode.statistics
     assert statistics is not None
