@@ -148,12 +148,6 @@ class CollisionRate:
         below, above = (math.exp(math.hypot(distance, rest)) for distance in self._log_distances())
         return scale * self.p / below, scale * min(self.p * above, most)
 
-    @property
-    def shares(self) -> dict[str, float]:
-        """Parts of the variance of log R as shares of it; empty where the rate is not determined."""
-        parts = self.log_variance if self.determined else {}
-        return {name: float(part / sum(parts.values())) for name, part in parts.items()}
-
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         frequency = self.frequency
@@ -166,7 +160,7 @@ class CollisionRate:
             "confidence": self.confidence,
             "determined": self.determined,
             "site_log_sd": self.site_log_sd,
-            "shares_of_variance": self.shares,
+            "log_variance": self.log_variance,
             "frequency": {**asdict(frequency), "per_hour": frequency.per_hour, "per_km": frequency.per_km},
             "fitted_to": self.fitted_to,
         }

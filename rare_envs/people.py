@@ -39,7 +39,7 @@ class HumanBenchmark:
         >>> low, high = CONTACTS_100CAR.interval_per_million_km
         >>> f"{CONTACTS_100CAR.per_million_km:.0f} ({low:.0f} to {high:.0f}) {CONTACTS_100CAR.kind}"
         '21 (16 to 27) contacts of all kinds'
-        >>> p, (low, high) = CUT_IN_CONTACTS_100CAR.per_event(0.26)  # cut-ins per km on US 101
+        >>> p, (low, high) = people_in("cut_in").contacts.per_event(0.26)  # cut-ins per km on US 101
         >>> f"{p:.1e} ({low:.1e} to {high:.1e})"
         '1.2e-06 (3.0e-08 to 6.7e-06)'
     """
@@ -103,45 +103,6 @@ def _count_shrp2(kind: str, count: int) -> HumanBenchmark:
     )
 
 
-CONTACTS_100CAR = _count_100car("contacts of all kinds", 68, "68 crashes, every contact")
-REAR_END_CONTACTS_100CAR = _count_100car("contacts into a vehicle ahead", 14, "rear-end, striking: 14 crashes")
-REAR_END_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a vehicle ahead", 385, "rear-end, striking: 385")
-CUT_IN_CONTACTS_100CAR = _count_100car("contacts begun by another's lane change", 1, "1 crash, rear-end")
-CUT_IN_NEAR_CRASHES_100CAR = _count_100car(
-    "near-crashes begun by another's lane change", 136, "136 near-crashes: 74 rear-end, 58 sideswipe, 4 others"
-)
-_STOPPED = (
-    'rear-end, striking; precipitating event "other vehicle ahead - slowed and stopped 2 seconds or less" or '
-    '"stopped on roadway more than 2 seconds"'
-)
-_DECELERATING = 'rear-end, striking; precipitating event "other vehicle ahead - but decelerating"'
-STOP_CONTACTS_100CAR = _count_100car("contacts with a lead that stopped", 13, f"{_STOPPED}: 6 + 7 crashes")
-STOP_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a lead that stopped", 132, f"{_STOPPED}: 101 + 31")
-SLOWING_CONTACTS_100CAR = _count_100car("contacts with a lead that slowed", 0, f"{_DECELERATING}: no crash")
-SLOWING_NEAR_CRASHES_100CAR = _count_100car("near-crashes with a lead that slowed", 152, f"{_DECELERATING}: 152")
-UNSEEN_CHANGES_100CAR = _count_100car(
-    "near-crashes in own lane changes into a vehicle that was not seen",
-    44,
-    '44 of the 74 near-crashes and 2 crashes in own lane changes: "did not see other vehicle during lane change"',
-)
-CONTACTS_SHRP2 = _count_shrp2("crashes without tyre strikes", 248 + 597)
-HUMAN_BENCHMARKS = (
-    CONTACTS_100CAR,
-    REAR_END_CONTACTS_100CAR,
-    CUT_IN_CONTACTS_100CAR,
-    STOP_CONTACTS_100CAR,
-    SLOWING_CONTACTS_100CAR,
-    _count_100car("near-crashes", 760, "760 near-crashes"),
-    REAR_END_NEAR_CRASHES_100CAR,
-    CUT_IN_NEAR_CRASHES_100CAR,
-    STOP_NEAR_CRASHES_100CAR,
-    SLOWING_NEAR_CRASHES_100CAR,
-    UNSEEN_CHANGES_100CAR,
-    CONTACTS_SHRP2,
-    _count_shrp2("severe crashes", 248),
-)
-"""All of them."""
-
 Event: TypeAlias = Literal["cut_in", "stop", "slowing"]
 """Another's lane change; a lead that brakes to a standstill; a lead that brakes without one."""
 Outcome: TypeAlias = Literal["contacts", "near_crashes"]
@@ -161,11 +122,43 @@ class PeopleInEvent(NamedTuple):
     near_crashes: HumanBenchmark
 
 
+_STOPPED = (
+    'rear-end, striking; precipitating event "other vehicle ahead - slowed and stopped 2 seconds or less" or '
+    '"stopped on roadway more than 2 seconds"'
+)
+_DECELERATING = 'rear-end, striking; precipitating event "other vehicle ahead - but decelerating"'
+_CUT_IN = "begun by another's lane change"
 _PEOPLE: dict[str, PeopleInEvent] = {
-    "cut_in": PeopleInEvent(CUT_IN_CONTACTS_100CAR, CUT_IN_NEAR_CRASHES_100CAR),
-    "stop": PeopleInEvent(STOP_CONTACTS_100CAR, STOP_NEAR_CRASHES_100CAR),
-    "slowing": PeopleInEvent(SLOWING_CONTACTS_100CAR, SLOWING_NEAR_CRASHES_100CAR),
+    "cut_in": PeopleInEvent(
+        _count_100car(f"contacts {_CUT_IN}", 1, "1 crash, rear-end"),
+        _count_100car(f"near-crashes {_CUT_IN}", 136, "136 near-crashes: 74 rear-end, 58 sideswipe, 4 others"),
+    ),
+    "stop": PeopleInEvent(
+        _count_100car("contacts with a lead that stopped", 13, f"{_STOPPED}: 6 + 7 crashes"),
+        _count_100car("near-crashes with a lead that stopped", 132, f"{_STOPPED}: 101 + 31"),
+    ),
+    "slowing": PeopleInEvent(
+        _count_100car("contacts with a lead that slowed", 0, f"{_DECELERATING}: no crash"),
+        _count_100car("near-crashes with a lead that slowed", 152, f"{_DECELERATING}: 152"),
+    ),
 }
+CONTACTS_100CAR = _count_100car("contacts of all kinds", 68, "68 crashes, every contact")
+UNSEEN_CHANGES_100CAR = _count_100car(
+    "near-crashes in own lane changes into a vehicle that was not seen",
+    44,
+    '44 of the 74 near-crashes and 2 crashes in own lane changes: "did not see other vehicle during lane change"',
+)
+HUMAN_BENCHMARKS = (
+    CONTACTS_100CAR,
+    _count_100car("contacts into a vehicle ahead", 14, "rear-end, striking: 14 crashes"),
+    _count_100car("near-crashes", 760, "760 near-crashes"),
+    _count_100car("near-crashes with a vehicle ahead", 385, "rear-end, striking: 385"),
+    *(count for people in _PEOPLE.values() for count in people),
+    UNSEEN_CHANGES_100CAR,
+    _count_shrp2("crashes without tyre strikes", 248 + 597),
+    _count_shrp2("severe crashes", 248),
+)
+"""All of them."""
 
 
 def people_in(event: Event) -> PeopleInEvent:

@@ -32,7 +32,6 @@ EVENT_NOUNS = {
 }
 """Events, and those of scenarios, in the plural."""
 SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulation"}
-PART_NOUNS = {"base": "base distribution", "site": "difference between sites", **SOURCE_NOUNS}
 LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
 """Rates from which whole numbers are shown, and below which powers of ten: alone, and beside a rate above `SMALL`."""
 
@@ -299,10 +298,8 @@ def _list_rates(report: Report, details: bool) -> Iterator[Row]:
     yield "collisions", per_km
     yield from (("", line) for line in tabulate_events(report.events))
     if details:
-        shares = sorted(rate.shares.items(), key=lambda part: -part[1])
-        parts = ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in shares if share > 0)
         events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
-        yield "", f"from {events}{f'; the uncertainty is {parts}' if parts else ''}"
+        yield "", "; ".join(filter(None, [f"from {events}", describe_uncertainty(exposure.TotalRate((rate,)))]))
     if injuries is not None and details:
         yield "", describe_injuries(injuries)
     elif injuries is not None:

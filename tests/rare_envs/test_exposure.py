@@ -57,9 +57,8 @@ def test_each_side_of_an_interval_of_p_adds_up_with_the_other_errors() -> None:
 def test_parts_of_the_variance_add_up_in_logarithms() -> None:
     found = rate(cov=0.1, counted=frequency(100), site_log_sd=1.5, spread=0.7)
     assert list(found.log_variance.values()) == pytest.approx([0.01, 0.01, 0.49, 2.25])
-    assert found.shares == pytest.approx(
-        {"counts": 0.01 / 2.76, "sampling": 0.01 / 2.76, "base": 0.49 / 2.76, "site": 2.25 / 2.76}
-    )
+    assert sum(each.share for each in TotalRate((found,)).shares) == pytest.approx(1.0)
+    assert TotalRate((found,)).shares[0] == ("site", "cut_in", pytest.approx(2.25 / 2.76))
     low, _ = found.interval_per_million_km
     assert math.log(found.per_million_km / low) == pytest.approx(1.959964 * math.sqrt(2.76))
 
@@ -67,7 +66,7 @@ def test_parts_of_the_variance_add_up_in_logarithms() -> None:
 def test_a_probability_that_is_not_determined_has_an_upper_end_only() -> None:
     found = rate(8e-14, spread=5.6, interval=(0.0, 1e-8), counted=frequency(100, 10.0, 100.0))
     assert found.interval_per_million_km == pytest.approx((0.0, 1e6 * 1e-8 * math.exp(1.959964 * 0.1)))
-    assert found.shares == {}
+    assert TotalRate((found,)).shares == ()
     assert not found.determined
 
 
