@@ -74,8 +74,11 @@ class FittedDistribution:
     """Provenance: sources, licence, site, date, coordinates, criteria of the selection; `provenance` of a file."""
     siblings: Callable[[str], Distribution] | None = field(default=None, repr=False)
     """Loader of other base distributions of the same scenario, by name or file."""
+    fitted_to: str = field(init=False, repr=False)
+    """The events in words, such as "38 + 15 events of 17 scenes"."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "fitted_to", self.events.describe())
         object.__setattr__(self, "refits", tuple(self.refits))
         object.__setattr__(self, "checks", tuple(self.checks))
         require_text("family", self.family)
@@ -125,11 +128,6 @@ class FittedDistribution:
     def clusters(self) -> int:
         """Number of independent clusters of events."""
         return self.events.clusters
-
-    @property
-    def fitted_to(self) -> str:
-        """The events in words, such as "38 + 15 events of 17 scenes"."""
-        return self.events.describe()
 
     @property
     def refit_families(self) -> tuple[int, ...]:
