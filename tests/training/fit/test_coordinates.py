@@ -90,7 +90,7 @@ def test_the_criterion_is_that_of_the_density_of_x(monkeypatch):
 
 
 def test_events_choose_the_system_that_they_come_from(quick):
-    events = closing_events(400)
+    events = closing_events(100)
     fits = [fit_system(events, system, FOLLOWING) for system in (PLAIN, LOG_GAP, CLOSING)]
     held_out = [held_out_log_prob(events, system, FOLLOWING) for system in (PLAIN, LOG_GAP, CLOSING)]
     assert choose_system([fit.bic for fit in fits], held_out, events.clusters) == 2
