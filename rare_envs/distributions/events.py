@@ -180,10 +180,15 @@ def describe_checks(checks: Iterable[Mapping[str, Any]]) -> str:
     """Return recorded and expected counts, entries of predictive checks, in words.
 
     Example:
-        >>> describe_checks([{"name": "TTC < 5 s", "recorded": 7, "expected": 15.94}])
-        'TTC < 5 s 7 / 15.94'
+        >>> names = "looked: TTC < 5 s", "looked: closing"
+        >>> describe_checks({"name": name, "recorded": 7, "expected": 15.94} for name in names)
+        'looked: TTC < 5 s 7 / 15.94, closing 7 / 15.94'
     """
-    return ", ".join(f"{each['name']} {each['recorded']} / {each['expected']:.4g}" for each in checks)
+    groups: dict[str, list[str]] = {}
+    for each in checks:
+        stratum, _, state = each["name"].rpartition(": ")
+        groups.setdefault(stratum, []).append(f"{state} {each['recorded']} / {each['expected']:.4g}")
+    return "; ".join(f"{stratum}: {', '.join(texts)}".removeprefix(": ") for stratum, texts in groups.items())
 
 
 def describe_motion(found: Mapping[str, Any]) -> str:

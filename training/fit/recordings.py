@@ -135,12 +135,10 @@ def _choose_neighbours(beside: Sequence[tuple[FloatArray, NDArray[Any]]]) -> Nei
     rows, labels = (np.concatenate(each) for each in zip(*beside, strict=True))
     clusters = np.asarray(np.unique(labels, return_inverse=True)[1].ravel(), dtype=np.int64)
     own = keep_neighbours(CUT_IN, rows, clusters, NEAR_IF_UNSEEN["us101"])
-    if len(own.rows) >= LEAST_NEIGHBOURS and len(np.unique(own.clusters)) >= MIN_CLUSTERS:
+    if len(own.rows) >= LEAST_NEIGHBOURS and own.events.counts.clusters >= MIN_CLUSTERS:
         return own
-    typer.echo(
-        f"{CUT_IN}: {len(own.rows)} neighbours at random times are too few; who has not looked is as at US 101",
-        err=True,
-    )
+    few = f"{len(own.rows)} neighbours at random times, of {own.events.counts.clusters} half-minutes"
+    typer.echo(f"{CUT_IN}: {few}, are too few; who has not looked is as at US 101", err=True)
     return load_base(scenario_named(CUT_IN), "us101")
 
 
