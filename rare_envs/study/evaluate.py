@@ -318,7 +318,7 @@ def _keeping(folder: Path, study: Study, journal: Journal, part: bool = False) -
             if n_further > 0:
                 count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
         again = f"rare-envs resume {shlex.quote(str(folder))}{' --trust' if study.question.trust else ''}"
-        return f" {count} are kept; go on with: {'the same command again' if part else again}"
+        return f" {count} are kept; go on with: {'the same command again.' if part else again}"
 
     try:
         yield target

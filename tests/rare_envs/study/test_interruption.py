@@ -15,7 +15,6 @@ import pytest
 
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, question, writing
-from rare_envs.study import risk as total_risk
 from samplers import estimation
 from samplers.journal import Journal
 from tests.rare_envs.study.fitted_files import write_fitted
@@ -128,24 +127,6 @@ def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monke
     assert result.stderr.startswith("Stopped after 10,000 simulations: P[A or B fails] so far ")
     stop_after(300, monkeypatch)
     assert_stopped(cli(*words), "Stopped: no estimate yet, the first batch of simulations was not complete.")
-
-
-def test_a_risk_says_what_was_done_before(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bases = [f"{name}={write_fitted(here / f'{name}.json', name)}" for name in ("cut_in", "hard_brake")]
-    words = ("risk", "idm", "--base", bases[0], "--base", bases[1], "--method", "mc", "--max-sim", "300")
-    run, made = total_risk.run, []
-
-    def stop_in_the_second(*arguments: Any) -> Any:
-        made.append(arguments)
-        if len(made) == 2:
-            stop_after(0, monkeypatch)
-        return run(*arguments)
-
-    monkeypatch.setattr(total_risk, "run", stop_in_the_second)
-    result = cli(*words)
-    assert result.exit_code == 143
-    assert "P[f <= 0] = 4.87e-01" in result.stderr  # at 0.26 cut-ins per km
-    assert f"\n{NOTHING} Done before: cut_in 130,000 per million km." in result.stderr
 
 
 def test_a_full_disk_in_mid_run_counts_each_simulation_once(

@@ -24,7 +24,7 @@ from rare_envs.simulation.observation import observation_space
 from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.events import EventRate, list_part_errors, sum_people
 from rare_envs.study.report import describe_left_out, find_frequency
-from rare_envs.study.risk import choose_base, compare_sites
+from rare_envs.study.risk import compare_sites
 from rare_envs.study.text import describe_model, format_rate, format_with_interval, list_uncalibrated, tabulate_events
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
 
@@ -156,11 +156,6 @@ def test_other_sites_are_known_from_the_same_simulations(monkeypatch: pytest.Mon
     assert list(factors) == ["near"]
     p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="near", method="mc", max_sim=4000))).estimate.p
     assert factors["near"] == pytest.approx(2 * p / own.estimate.p, rel=0.15)
-
-
-def test_the_base_of_a_scenario_at_a_site() -> None:
-    assert choose_base(HARD_BRAKE, None, "us101") == "us101"
-    assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == "mine.json"
 
 
 def test_a_rate_has_two_digits_and_with_its_interval_one_form() -> None:

@@ -59,8 +59,8 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
     tmp_path: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped in the second scenario: nothing that was simulated is simulated again, and no journal is left."""
-    monkeypatch.setattr(DrivingProblem, "tile", 100)
-    attempt, made, most = DrivingProblem.attempt, [0], [500]
+    monkeypatch.setattr(DrivingProblem, "tile", 30)
+    attempt, made, most = DrivingProblem.attempt, [0], [150]
 
     def stopping(self: DrivingProblem, x: Any) -> Any:
         if made[0] + len(x) > most[0]:
@@ -70,14 +70,18 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
 
     monkeypatch.setattr(DrivingProblem, "attempt", stopping)
     bases = ("--base", f"hard_brake={brakings}", "--base", f"cut_in={write_fitted(tmp_path / 'cut.json', 'cut_in')}")
-    words = ("risk", "idm", *bases, "--method", "mc", "--max-sim", "400", "--seed", "4", "--out")
+    words = ("risk", "idm", *bases, "--method", "mc", "--max-sim", "120", "--seed", "4", "--out")
     stopped = cli(*words, tmp_path / "run")
-    assert stopped.exit_code == 130 and "100 simulations are kept; go on with: the same command again" in stopped.stderr
+    assert stopped.exit_code == 130
+    kept = "30 simulations are kept; go on with: the same command again. Done before: cut_in "
+    assert kept in stopped.stderr
     assert (tmp_path / "run" / "cut_in" / JOURNAL).exists() and not (tmp_path / "run" / "risk.json").exists()
     assert_refused(cli(*words, tmp_path / "run", "--seed", 5), "is of another question", "--force")
     most[0], before = 2000, made[0]
-    assert cli(*words, tmp_path / "run").exit_code in (0, 3)
-    assert 300 <= made[0] - before < 400  # a few are made again to see that f is what it was
+    done = cli(*words, tmp_path / "run")
+    assert done.exit_code in (0, 3) and done.stdout.startswith("idm: collisions per million km ")
+    assert done.stdout.endswith(f"Wrote {tmp_path / 'run'}.\n") and (tmp_path / "run" / "risk.png").exists()
+    assert 90 <= made[0] - before < 120  # a few are made again to see that f is what it was
     assert not list((tmp_path / "run").glob(f"*/{JOURNAL}"))
     most[0] = 4000
     assert cli(*words, tmp_path / "whole").exit_code in (0, 3)

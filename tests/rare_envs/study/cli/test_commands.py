@@ -240,16 +240,6 @@ FEW = ("--method", "mc", "--max-sim", 300)
 BRAKE = ("estimate", "rare_envs/HardBrake-v0", *FEW)
 
 
-def test_the_table_and_the_folder(cli: Cli, here: Path) -> None:
-    names = ("cut_in", "hard_brake")
-    bases = [word for name in names for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")]
-    result = cli("risk", "idm", *bases, *FEW, "--out", here / "out")
-    assert result.exit_code == 0, result.output
-    assert result.stdout.startswith("idm: collisions per million km ")
-    assert result.stdout.endswith(f"Wrote {here / 'out'}.\n")
-    assert (here / "out" / "risk.png").exists()
-
-
 def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
     short = " ".join(cli(*BRAKE, "--base", base).stdout.split())
