@@ -52,11 +52,17 @@ def across(x: Tensor, scenario: Scenario = STEADY) -> np.ndarray:
 FREE = across(point())
 
 
-def test_in_free_traffic_the_change_takes_its_duration() -> None:
-    """Along the road the cutter is slower by the cosine: of a slope of 1.5 x 3.5 m / 80 m at most, so by 0.2 %."""
-    s = np.minimum(np.arange(101) / 40.0, 1.0)
-    assert np.abs(FREE - 3.5 * (1.0 - 3.0 * s**2 + 2.0 * s**3)).max() < 3.5 * 1.5 * 0.0022
-    assert FREE[0] == 3.5 and FREE[-1] == 0.0 and not evades(point())
+@pytest.mark.parametrize("duration", [2.5, 4.0, 7.5])
+def test_in_free_traffic_the_change_takes_its_duration(duration: float) -> None:
+    """y = 3.5 m (1 - 3 s^2 + 2 s^3) with s = t / duration; along the road the cutter is slower by the cosine.
+
+    That is of a slope of 1.5 x 3.5 m / (20 m/s duration) at most: by half its square.
+    """
+    x = point(duration=duration)
+    y, s = across(x), np.minimum(np.arange(101) / (10.0 * duration), 1.0)
+    slower = (1.5 * 3.5 / (20.0 * duration)) ** 2 / 2
+    assert np.abs(y - 3.5 * (1.0 - 3.0 * s**2 + 2.0 * s**3)).max() < 3.5 * 1.5 * slower
+    assert y[0] == 3.5 and y[-1] == 0.0 and not evades(x)
 
 
 def evades(x: Tensor) -> bool:
@@ -143,8 +149,8 @@ def draws(n: int) -> Tensor:
 @pytest.mark.parametrize("looks", [True, False])
 def test_whoever_looks_never_moves_into_a_body_beside_it(looks: bool) -> None:
     """Contacts flank to flank while y falls, after the place has been taken for over 0.6 s: none, and many unless."""
-    episodes = drive(World(CutterModel(looks=looks).scenario()), Coasting(), draws(4000))
-    taken = torch.zeros(4000)  # ticks for which the ego has been beside the cutter or too fast behind it
+    episodes = drive(World(CutterModel(looks=looks).scenario()), Coasting(), draws(2000))
+    taken = torch.zeros(2000)  # ticks for which the ego has been beside the cutter or too fast behind it
     before, into = next(episodes), 0
     for after in episodes:
         ego, cutter = before.state.vehicles[:2]
@@ -155,16 +161,15 @@ def test_whoever_looks_never_moves_into_a_body_beside_it(looks: bool) -> None:
         falling = after.state.y[:, 1] < before.state.y[:, 1]
         into += int((after.collided & ~before.collided & flank & falling & (taken > 6)).sum())
         before = after
-    assert into == 0 if looks else into > 100
+    assert into == 0 if looks else into > 50
 
 
 def test_the_later_it_is_noticed_the_more_often_they_touch() -> None:
     """Noticed 0.1, 0.5 and 1.5 s after the body is over the line, and never."""
-    x, touched = draws(2000), []
-    x[:, NAMES.index("attention")] = ATTENTION_LIMIT - 1.0
-    for noticing in (0.0, np.log(5.0) / 0.3, np.log(15.0) / 0.3, -3.0):
-        x[:, NAMES.index("noticing")] = noticing
-        touched.append(int(rollout(World(CUT_IN_V1), Coasting(), x).collided.sum()))
+    x = draws(800).repeat(4, 1, 1)
+    x[..., NAMES.index("attention")] = ATTENTION_LIMIT - 1.0
+    x[..., NAMES.index("noticing")] = tensor(0.0, np.log(5.0) / 0.3, np.log(15.0) / 0.3, -3.0)[:, None]
+    touched = rollout(World(CUT_IN_V1), Coasting(), x.flatten(0, 1)).collided.view(4, -1).sum(1).tolist()
     assert touched == sorted(touched) and touched[-1] > 1.2 * touched[0] > 0
 
 
@@ -213,9 +218,9 @@ def test_the_indicator_is_on_until_the_change_is_over() -> None:
 
 def test_without_looks_and_heuristic_and_braking_it_is_the_script_of_the_first_version() -> None:
     x = torch.from_numpy(
-        rare_envs.DrivingProblem("rare_envs/CutIn-v0", base="i80").base.sample(400, np.random.default_rng(2))
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", base="i80").base.sample(100, np.random.default_rng(2))
     )
-    rest = tensor(4.0, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0).expand(400, -1)
+    rest = tensor(4.0, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0).expand(100, -1)
     own_speed = replace(CUTTER_IDM, desired_speed=1.0)  # no faster than at the start
     script = CutterModel(looks=False, idm=own_speed, coolness=None).scenario()
     for one, other in zip(states(torch.cat((x, rest), dim=1), script), states(x, CUT_IN), strict=True):

@@ -7,11 +7,9 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs import IDM
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.scenarios.cut_in import CUT_IN, CUT_IN_V1, bezier
+from rare_envs.scenarios.cut_in import CUT_IN, bezier
 from rare_envs.simulation import drive
-from rare_envs.simulation.settings import Clock
 from rare_envs.simulation.world import World
 from tests.rare_envs.traffic_states import F64, tensor
 
@@ -76,28 +74,3 @@ def test_cutter_arrives_in_the_lane_and_minds_its_lead() -> None:
     assert state.heading[0, 1].item() == 0.0
     assert state.x[0, 2] - state.x[0, 1] > 5.0  # 8 m/s faster than the lead at first, and still behind it
     assert state.speed[0, 2].item() == 12.0
-
-
-def drive_straight(duration: float, offset: float = 3.0, speed: float = 34.0, dt: float = 0.05) -> torch.Tensor:
-    """Return y of a cutter that keeps its speed, as fast as it wishes, at each tick from the start on."""
-    world = World(CUT_IN_V1, clock=Clock(dt, 1.5 * duration))
-    x = tensor(20.0, speed, speed, 40.0, 150.0, offset, duration, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0)
-    return torch.stack([each.state.y[0, 1] for each in drive(world, IDM(), x[None])])
-
-
-@pytest.mark.parametrize("duration", [2.0, 4.0, 7.5])
-def test_a_change_takes_its_duration_and_crosses_the_marking_in_its_middle(duration: float) -> None:
-    """y = offset (1 - 3 s^2 + 2 s^3) with s = t / duration: half way across at s = 1/2, by a fifth at s = 0.287.
-
-    Along the road the cutter is slower by the cosine of its heading: by 0.0014 in the mean at 2 s (a slope of
-    1.5 x 3 m / 60 m at most), less in longer changes.
-    """
-    dt = 0.05
-    y = drive_straight(duration, dt=dt)
-    t = dt * torch.arange(len(y), dtype=F64)
-    s = (t / duration).clamp(max=1.0)
-    assert (y - 3.0 * (1.0 - 3.0 * s**2 + 2.0 * s**3)).abs().max() < 3.0 * 1.5 * 0.0015
-    crossing = t[y <= 1.5][0].item()
-    assert duration / 2 <= crossing <= duration / 2 * 1.0015 + dt
-    assert t[y <= 0.8 * 3.0][0].item() == pytest.approx(0.287 * duration, abs=dt + 0.001 * duration)
-    assert y[-1].item() == 0.0
