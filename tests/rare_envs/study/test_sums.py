@@ -12,7 +12,7 @@ import pytest
 
 import rare_envs
 from rare_envs.problem import DrivingProblem
-from rare_envs.study import BadInput, Question, prepare, run, run_into
+from rare_envs.study import BadInput, Question, prepare, run, run_into, writing
 from rare_envs.study.html_report import write_html_report
 from rare_envs.study.report import Report, judge_rate
 from rare_envs.study.run_folder import JOURNAL
@@ -59,6 +59,7 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
     tmp_path: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped in the second scenario: nothing that was simulated is simulated again, and no journal is left."""
+    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
     monkeypatch.setattr(DrivingProblem, "tile", 30)
     attempt, made, most = DrivingProblem.attempt, [0], [150]
 
