@@ -55,7 +55,7 @@ def start(world: World, x: Tensor) -> MultiAgentEpisode:
             traffic.state.seen_by(j),
             _view_perception(traffic.perception, j),
             camera_context=camera and camera._replace(viewer=j),
-        )
+        )._replace(overridden=none)
         for j in range(1, world.scenario.vehicles)
     )
     return MultiAgentEpisode(traffic, (traffic, *others), none)
@@ -81,6 +81,7 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
     hit = hit | off
     views = [traffic]
     for j, view in enumerate(episode.views[1:], start=1):
+        view = view._replace(overridden=traffic.overridden)
         views.append(world.update(view, state.seen_by(j), _view_perception(traffic.perception, j), hit[:, j]))
     held = tuple(
         hold_finished(old.collided, old, new) if bool(old.collided.any()) else new

@@ -226,8 +226,8 @@ class HumanDriver:
         offset = lateral.abs()
         since = torch.where(offset <= memory.zone, memory.since + 1, -1)
         noticed = since >= round(model.noticing_time / dt)
-        if self.world.scenario.signals is not None and model.notice_indicator:
-            noticed = noticed | self.world.scenario.signals(state)
+        signals = self.world.find_signals(episode) if model.notice_indicator else None
+        noticed = noticed if signals is None else noticed | signals
         ahead = find_ahead(state, noticed, memory.speeds, dt)
         on_left = on_right = torch.zeros_like(episode.collided)
         near = noticed & memory.beside & (offset < VEHICLE_WIDTH + model.evasive_clearance)

@@ -75,8 +75,8 @@ def find_crashed(episode: Episode, row: int = 0) -> Collection[int]:
 
 def find_signals(world: World, episode: Episode, row: int = 0) -> set[int]:
     """Return the vehicles with their indicator on, in a row."""
-    signals = world.scenario.signals
-    return set() if signals is None else {j + 1 for j, on in enumerate(signals(episode.state)[row].tolist()) if on}
+    signals = world.find_signals(episode)
+    return set() if signals is None else {j + 1 for j, on in enumerate(signals[row].tolist()) if on}
 
 
 def make_network(road: Road, x: float) -> Any:

@@ -74,8 +74,8 @@ class NearCrash(EpisodeMeasure):
     a crash" (VTTI, "Researcher dictionary for video reduction data" 1.3, 2012, variable 5). Required is what the ego
     does if the same ego with the same noise in the same scenario, its actions limited by `avoid_rapid`, collides: f is
     -1. Episodes without a rapid manoeuvre are such ones by themselves; others are driven a second time, by
-    `DrivingProblem`. A single rollout, as a step of an environment, gives their own time to collision, which is above
-    f. Where another vehicle had to evade (`Scenario.evades`) f is 0 at most; -100 in a collision.
+    `DrivingProblem`. A single rollout, as a step of an environment, gives their own time to collision. Where another
+    vehicle had to evade (`Scenario.evades`) f is 0 at most; -100 in a collision.
     """
 
     unit = "s"

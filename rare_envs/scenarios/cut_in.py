@@ -10,6 +10,7 @@ moves into whoever is beside it.
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -208,6 +209,9 @@ class CutterModel:
         Dingus et al., "The 100-Car Naturalistic Driving Study", 2006, events: who had not looked, and turned back.
         Olsen, "Modeling slow lead vehicle lane changing", 2003: indicators.
 
+    Raises:
+        ValueError: A parameter is negative or no number, or a share above 1.
+
     Example:
         >>> CutterModel(looks=False).scenario().name  # a cutter that never looks
         'cut_in'
@@ -247,6 +251,23 @@ class CutterModel:
     loss: tuple[float, float] = (1.572, 0.318)
     """The same of its loss of speed [m/s], which is at most its speed; the correlation of 0.32 is left out."""
 
+    def __post_init__(self) -> None:
+        shares = {"oblivious", "indicating", "coolness"}
+        for name in (
+            *shares,
+            "reaction_time",
+            "most_braking",
+            "margin",
+            "noticing",
+            "noticing_spread",
+            "brakings_per_km",
+        ):
+            value, most = getattr(self, name), 1.0 if name in shares else sys.float_info.max
+            if value is not None and not 0.0 <= value <= most:
+                raise ValueError(f"Expected {name} of the cutter from 0 to {most:.3g}, got {value!r}.")
+        if not 0.0 < self.braking_window < math.inf:
+            raise ValueError(f"Expected a braking_window above 0 s, got {self.braking_window!r}.")
+
     def scenario(self) -> Scenario:
         """Return the scenario with this cutter."""
         return replace(
@@ -270,11 +291,11 @@ class CutterModel:
         delay = self.noticing * torch.exp(self.noticing_spread * noticing)
         delay = torch.where((noticing < oblivious) | (not self.looks), math.inf, delay)
         delay = torch.where((attention < limit) | (not self.looks), delay, -math.inf)
-        chance = (lead_speed * (self.brakings_per_km / 1000.0 * self.braking_window)).clamp(1e-6, 1.0)
-        rank = torch.special.ndtr(braking) / chance
+        chance = (lead_speed * (self.brakings_per_km / 1000.0 * self.braking_window)).clamp_max(1.0)
+        rank = torch.special.ndtr(braking) / chance.clamp_min(1e-6)
         peak = torch.exp(self.peak[0] + self.peak[1] * peak)
         loss = torch.minimum(torch.exp(self.loss[0] + self.loss[1] * loss), lead_speed)
-        zero, brakes = torch.zeros_like(offset), (rank < 1.0) & (loss > 0.0)
+        zero, brakes = torch.zeros_like(offset), (rank < 1.0) & (chance > 0.0) & (loss > 0.0)
         state = _start(x)
         theta = CutInTheta(
             length=(cut_in_speed * duration).clamp(min=CUT_IN_MIN_LENGTH),

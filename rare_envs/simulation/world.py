@@ -189,7 +189,7 @@ class World:
 
     def update(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
         """Return episodes a tick later: new state, lidar features and hits of the vehicle in the ego's place, (B,)."""
-        moment = self._moment(state, episode.road, perception, episode.state)
+        moment = self._moment(state, episode.road, perception, episode.state, episode.overridden)
         collided = episode.collided | hit
         measure_state = episode.measure.update(episode.measure_state, moment, episode.collided, collided)
         statistics, camera_context = episode.statistics, episode.camera_context
@@ -265,10 +265,26 @@ class World:
         episode = episode._replace(background_state=background_state, overridden=overridden)
         return self.update(episode, state, perception, hit)
 
-    def _moment(self, state: State, road: Road, perception: Tensor | None, before: State | None) -> Moment:
-        """Return the moment of a state, with others' evasions if the measure counts them."""
+    def find_signals(self, episode: Episode) -> Tensor | None:
+        """Return whose indicator is on, as `Scenario.signals`, of those that nobody has commanded; None without any."""
+        if self.scenario.signals is None:
+            return None
+        on = self.scenario.signals(episode.state)
+        return on if episode.overridden is None else on & ~episode.overridden[:, 1:]
+
+    def _moment(
+        self,
+        state: State,
+        road: Road,
+        perception: Tensor | None,
+        before: State | None,
+        overridden: Tensor | None = None,
+    ) -> Moment:
+        """Return the moment of a state, with others' evasions if the measure counts them and nobody commands them."""
         evades = self.scenario.evades if self.measurement.episode_measure.twice else None
         evading = None if evades is None else evades(state)
+        if evading is not None and overridden is not None:
+            evading = evading & ~overridden[:, 1:].any(dim=1)
         return Moment(state, lead_of(state, road), road, perception, before, self.clock.dt, evading)
 
     def _least_ttc(self, measure_state: Tensor) -> Tensor | None:

@@ -111,6 +111,18 @@ def test_a_cutter_that_is_an_agent_goes_where_it_is_driven_and_keeps_off_once_it
     assert driven.state()[1, 1] == pytest.approx(4.0, abs=0.1)  # it keeps the lane that it was in, by IDM
 
 
+@pytest.mark.parametrize("commanded", [False, True])
+def test_a_cutter_that_is_commanded_neither_signals_nor_evades(commanded: bool) -> None:
+    """It has not looked, and its script turns back beside the ego; whoever drives it keeps off by another way."""
+    env = rare_envs.parallel_env("rare_envs/CutIn-v1", agents=["ego", "cutter"], measure="near_crash")
+    env.reset(options={"x": [20.0, 20.0, 20.0, -3.0, 60.0, 2.9, 4.0, -9.0, *[0.0] * 5]})
+    for _ in range(10):
+        env.step({"cutter": np.zeros(2, np.float32)} if commanded else {})
+    signals = env.world.find_signals(env._episode.traffic)
+    assert signals is not None and signals.tolist() == [[not commanded, False]]
+    assert [view.f.item() <= 0.0 for view in env._episode.views[:2]] == [not commanded] * 2
+
+
 def test_who_crashes_leaves_and_the_others_drive_on():
     env = rare_envs.parallel_env(CUT_IN)
     env.reset(options={"x": [20.0, 20.0, 20.0, 5.0, 60.0, 4.0]})

@@ -201,6 +201,7 @@ def test_a_lead_brakes_once_in_a_parabola() -> None:
     way = 20.0 * 10.0 - loss * (8.0 - lasting / 2) + 0.1 * loss / 2  # half a step of Euler's method
     assert place[-1] - place[0] == pytest.approx(way, abs=1e-2)
     never = states(point(lead_braking=ndtri(0.246) + 1e-6))
+    never += states(point(lead_braking=-40.0), CutterModel(brakings_per_km=0.0).scenario())
     assert all(each.speed[0, 2] == 20.0 for each in never)
     slow = states(point(lead_speed=2.0, cut_in_speed=2.0, ego_speed=2.0, lead_braking=-9.0))
     assert slow[-1].speed[0, 2] == 0.0  # no more than its speed is lost
@@ -241,6 +242,21 @@ def test_the_cutter_speeds_up_behind_a_faster_lead_as_human_drivers_do() -> None
     x = point(lead_speed=30.0, lead_gap=100.0)
     start, later = (states(x, CUT_IN_V1)[tick].speed[0, 1].item() for tick in (0, 10))
     assert start == 20.0 and later - start == pytest.approx(1.0 - (20.0 / (120 / 3.6)) ** 4, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("indicating", -0.2),
+        ("oblivious", 1.5),
+        ("coolness", np.nan),
+        ("reaction_time", np.inf),
+        ("braking_window", 0.0),
+    ],
+)
+def test_a_cutter_that_cannot_be_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        CutterModel(**{name: value})  # type: ignore[arg-type]
 
 
 def test_drivers_take_the_pedals_and_not_the_looks() -> None:
