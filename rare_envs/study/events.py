@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 import samplers
 from rare_envs.exposure import CollisionRate
@@ -116,17 +115,16 @@ def list_part_errors(estimate: samplers.Estimate) -> list[BaseUncertainty | None
         failures = analysis.weigh_failures(estimate)
     except ValueError:  # nothing failed, or p is no sum over points
         return [None] * len(estimate.parts)
-    strata = read_strata(estimate.base)
+    strata, found = read_strata(estimate.base), list[BaseUncertainty | None]()
     which = np.argmax([each.base.log_prob(failures.x) for each in strata], axis=0)  # densities are 0 in the others
-    return [_find_base_error(estimate, failures, which == k) for k in range(len(estimate.parts))]
-
-
-def _find_base_error(
-    estimate: samplers.Estimate, failures: analysis.WeightedFailures, here: NDArray[np.bool_]
-) -> BaseUncertainty | None:
-    """Return what the events behind the base leave open of the part of p at some of the failing points."""
-    if not here.any():
-        return None
-    h = here.astype(np.float64)
-    own = analysis.expect_over_failures(failures, h, estimate.confidence)
-    return analysis.expect_under_refits(estimate, failures, h, own)
+    for number, part in enumerate(estimate.parts):
+        here = (which == number).astype(np.float64)
+        own = analysis.FailureExpectation(
+            value=part.share * part.p,
+            interval=(part.share * part.interval[0], part.share * part.interval[1]),
+            confidence=estimate.confidence,
+            cov=part.cov,
+            per_failure=part.of_sum,
+        )
+        found.append(analysis.expect_under_refits(estimate, failures, here, own) if here.any() else None)
+    return found
