@@ -72,6 +72,7 @@ from training.fit.strata import (
 
 COMMAND = "rare-envs fit --data DIR --out rare_envs/data"
 FOLLOWING, CUT_IN_V0, CUT_IN_V1, BRAKING = "car_following", "rare_envs/CutIn-v0", "rare_envs/CutIn-v1", "hard_brake"
+TEST_KIND = "test distribution: cutters as nobody drives, of gaps that drivers refuse too; fitted to recorded events"
 CIRCLES_FILE, PROFILES_FILE = "i24_circles_following.parquet", "lane_change_profiles.parquet"
 CHANGES_FILE = "us101_lane_changes.csv"
 COIFMAN_FILE = "i80_coifman.parquet"
@@ -163,6 +164,8 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
     stratified = base.scenario == CUT_IN_V1 and not base.test
     asked["neighbours"] = read_neighbours(data, str(base.changes)) if stratified else None
     fitted = fit_base(base.scenario, events, source, COMMAND, system=base.system, **asked)
+    if base.test or base.scenario == CUT_IN_V0:
+        fitted = replace(fitted, record={**fitted.record, "kind": TEST_KIND})
     fitted = _add_attitudes(fitted) if base.test else fitted
     return format_base(base.scenario, fitted.to_dict())
 
@@ -170,12 +173,10 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
 def _add_attitudes(fitted: FittedDistribution) -> FittedDistribution:
     """Return a distribution of starts, from which nobody was refused, with standard normal attitudes behind."""
     free = CutNormals(np.full(ATTITUDES, -np.inf), np.full(ATTITUDES, np.inf))
-    kind = "test distribution: cutters as nobody drives, of gaps that drivers refuse too; fitted to recorded events"
     return replace(
         fitted,
         distribution=join_independent(fitted.distribution, free),
         refits=tuple(join_independent(each, free) for each in fitted.refits),
-        record={**fitted.record, "kind": kind},
     )
 
 
