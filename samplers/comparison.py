@@ -12,8 +12,8 @@ from scipy.special import stdtrit
 from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, summarise_refits
 from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.weighted import (
-    MIN_UNITS,
     cov_inflation,
+    find_missed,
     has_independent_points,
     interval_of_sum,
     require_sample,
@@ -345,26 +345,8 @@ def _ratio(a: float, b: float) -> float:
 
 
 def _find_missed(own: FloatArray, totals: FloatArray, either: Estimate) -> tuple[float, list[str]]:
-    """Return how much strata may add to a kind of failure that they hardly showed, and their names; 0 without strata.
-
-    That is the root of the sum of (w_k h_k s_k)^2, h_k the upper end of P[A or B fails | stratum], s_k the bound of a
-    share that none of the effective failing draws there had (1 where that probability is not resolved).
-
-    Args:
-        own: Unit totals of the kind, (n_units,).
-        totals: Those of A and B, (2, n_units).
-        either: Estimate of P[A or B fails].
-    """
-    squares, names, first = 0.0, list[str](), 0
-    for part in either.parts:
-        units = slice(first, first + part.n_units)
-        first = units.stop
-        if part.resolved and effective_number(own[units]) >= MIN_UNITS:
-            continue
-        draws = round(effective_number(totals.max(axis=0)[units])) if part.resolved else 0
-        squares += (part.share * part.interval[1] * zero_hit_bound(draws, either.confidence)) ** 2
-        names.append(part.name)
-    return math.sqrt(squares), names
+    """Return `find_missed` of the unit totals of A or of B, (n_units,) of (2, n_units)."""
+    return find_missed(either.parts, np.arange(len(own)), totals.max(axis=0), own, either.confidence)
 
 
 def _side(own: FloatArray, totals: FloatArray, factor: float, single: bool, either: Estimate) -> Side:

@@ -4,8 +4,9 @@ Every stratum has runs of its own under its own base distribution. First come pi
 equal parts. The rest goes to the strata by Neyman's rule, in proportion to w_k times the width of the interval of p_k
 for one simulation: that is its standard deviation where failures were met, and what may be there where none was. One
 whose part of the rest is no larger than its pilot keeps the pilot; any other has a new run, and p_k is
-that of the new run alone, so that the pilot decides how large the run is and adds nothing to it: unbiased. Counts of
-plain draws are pooled with those of the pilot, which makes p too low by about a tenth of its standard error
+that of the new run alone, so that the pilot decides how large the run is and adds nothing to it. Only where the new run
+meets no failure and the pilot did, both count, by their simulations: so p is a little too high where failures are few.
+Counts of plain draws are pooled with those of the pilot, which makes p too low by about a tenth of its standard error
 (`benchmarks/samplers/strata.py`).
 
 With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in strata whose own c.o.v. is above
@@ -17,7 +18,8 @@ left are plain draws, which bring its upper end down: so are the `plain_draws` t
 max_sim, as it does where they take seconds.
 
 Where the method is `Auto`, pilots are plain draws, and a stratum in which some of them failed goes on with plain draws:
-where p_k is above some 0.005 a search gains little, and it may miss one of many regions.
+where p_k is above some 0.005 a search gains little, and it may miss one of many regions. So do all strata where there
+are not 300 simulations for a search of each that hardly failed.
 
 References:
     Neyman, "On the two different aspects of the representative method", Journal of the Royal Statistical Society 97,
@@ -57,6 +59,10 @@ PILOT_DRAWS = 1000
 """Draws of a pilot of plain draws where there is no max_sim."""
 OFTEN = 4
 """Failures of a pilot of plain draws from which its stratum needs no search."""
+LEAST_SEARCH = 300
+"""Simulations of a search in each stratum that hardly failed, at least; else all have plain draws. A search of fewer
+may meet nothing where plain draws do: as what met a failure counts, p would be too large on average, by a third with
+100 simulations."""
 PILOT_COV = 0.3
 """C.o.v. at which pilots stop where there is a target; a larger target takes its place."""
 MARGIN = 0.9
@@ -167,7 +173,7 @@ class _Sum:
         """
         k, left, target = len(self.parts), self.goal.max_sim and self.goal.max_sim - self.n_sim, self.goal.target_cov
         rare = [i for i in range(k) if (self.parts[i].outcome.counts or (0, 0))[0] < OFTEN]
-        if left is not None and left < 2 * FEWEST * len(rare):
+        if left is not None and left < 2 * LEAST_SEARCH * len(rare):
             self.searched |= {*rare}
             rare = []
         if rare and (left is not None or target is not None):
@@ -181,7 +187,7 @@ class _Sum:
     def _find_method(self, stratum: int) -> Stepping | None:
         """Return plain draws for a stratum in whose pilot some failed, or that was searched in vain; else None."""
         hits, _ = self.parts[stratum].outcome.counts or (0, 0)
-        in_vain = stratum in self.searched and self._is_unresolved(stratum)
+        in_vain = stratum in self.searched and (hits > 0 or self._is_unresolved(stratum))
         return PlainDraws() if self.chooses and (hits >= OFTEN or in_vain) else None
 
     def _is_unresolved(self, stratum: int) -> bool:

@@ -285,6 +285,8 @@ def compute_exceedance(
     use = np.flatnonzero(sums.ess >= MIN_UNITS)
     low, high = simultaneous_intervals(sums, use, sums.p, cov, estimate.confidence, estimate.seed)
     low = np.maximum.accumulate(low)
+    terms = (failures.weights * (f <= grid[i]) for i in use)
+    high[use] = [failures.add_missed(own, end, estimate.confidence) for own, end in zip(terms, high[use], strict=True)]
     high = np.minimum.accumulate(high[::-1])[::-1]
     here = place[:-1]
     enough = np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)

@@ -21,10 +21,18 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
-from samplers.method import EstimateData
+from samplers.method import EstimateData, Part
 from samplers.output import to_json_value
 from samplers.problem import FloatArray
-from samplers.sample import Interval, Sample, clopper_pearson, degrees_of_freedom, effective_number, log_normal_interval
+from samplers.sample import (
+    Interval,
+    Sample,
+    clopper_pearson,
+    degrees_of_freedom,
+    effective_number,
+    log_normal_interval,
+    zero_hit_bound,
+)
 
 MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t
@@ -91,6 +99,43 @@ def add_unresolved(
         squares += unresolved * (new_shares.get(part.name, part.share) * part.interval[1]) ** 2
         first = end
     return np.asarray(np.where(squares > 0, np.minimum(p + np.hypot(high - p, np.sqrt(squares)), 1.0), high))
+
+
+def find_missed(
+    parts: Sequence[Part],
+    units: NDArray[np.int64],
+    weights: FloatArray,
+    terms: FloatArray,
+    confidence: float,
+) -> tuple[float, list[str]]:
+    """Return how much strata may add to a kind of failure that they hardly showed, and their names; 0 without strata.
+
+    That is the root of the sum of (w_k h_k s_k)^2, h_k the upper end of p_k, s_k the bound of a share that none of the
+    effective failing draws of the stratum had (1 where p_k is not resolved).
+
+    Args:
+        parts: Of the estimate.
+        units: Independent units of the failing points, (k,).
+        weights: Their weights, (k,).
+        terms: The weights as the kind has them, 0 at points of other kinds, (k,).
+        confidence: Of h_k and s_k.
+    """
+    squares, names, first = 0.0, list[str](), 0
+    for part in parts:
+        end = first + part.n_units
+        here = (units >= first) & (units < end)
+        own, all_of_it = (_count_units(units[here] - first, each[here]) for each in (terms, weights))
+        first = end
+        if not part.resolved or own < MIN_UNITS:
+            draws = round(all_of_it) if part.resolved else 0
+            squares += (part.share * part.interval[1] * zero_hit_bound(draws, confidence)) ** 2
+            names.append(part.name)
+    return math.sqrt(squares), names
+
+
+def _count_units(units: NDArray[np.int64], terms: FloatArray) -> float:
+    """Return the effective number of units behind terms (k,) of points of these units (k,)."""
+    return effective_number(np.bincount(units, weights=terms).astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +285,8 @@ class WeightedFailures:
     """Factor by which the estimate's c.o.v. exceeds that of the weights' sum."""
     total: int
     """Failing points that the run has."""
+    parts: tuple[Part, ...] = ()
+    """Strata of the run."""
 
     def unit_totals(self, terms: FloatArray) -> FloatArray:
         """Return the sums over units of terms (k,) or (k, m): one row for each unit that has a point."""
@@ -260,7 +307,12 @@ class WeightedFailures:
         value, cov, units = float(terms.sum()), self.cov_of_sum(terms), effective_number(self.unit_totals(terms))
         # in units of the largest value, so that the cut at 1 is the bound
         low, high = interval_of_sum(value / largest, cov, units, self.independent, confidence)
-        return value, cov, (low * largest, high * largest)
+        return value, cov, (low * largest, self.add_missed(terms, high * largest, confidence, largest))
+
+    def add_missed(self, terms: FloatArray, high: float, confidence: float, largest: float = 1.0) -> float:
+        """Return the upper end of the sum of terms (k,), `high`, with what strata that hardly showed it may add."""
+        missed, value = largest * find_missed(self.parts, self.units, self.weights, terms, confidence)[0], terms.sum()
+        return min(largest, float(value + np.hypot(high - value, missed))) if missed > 0 else high
 
     def mean_of(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return E[h(X) | failure] and its standard error, (m,) each, of m quantities h (k, m) at these points.
@@ -332,6 +384,7 @@ def _weigh_rows(estimate: EstimateData, rows: NDArray[np.int64]) -> WeightedFail
         independent=has_independent_points(sample),
         inflation=1.0,
         total=len(failing),
+        parts=estimate.parts,
     )
     return replace(raw, inflation=cov_inflation(estimate, raw.cov_of_sum(raw.weights)))
 
@@ -410,7 +463,8 @@ def sum_by_label(estimate: EstimateData, rows: NDArray[np.int64], labels: NDArra
         p, cov, interval = failures.estimate_sum(terms, estimate.confidence)
         if unscaled and np.isclose((failures.unit_totals(terms) ** 2).sum() * n, p, rtol=1e-9, atol=0.0):  # a count
             cov = cov / failures.inflation
-            interval = clopper_pearson(round(p * n), n, estimate.confidence)
+            low, high = clopper_pearson(round(p * n), n, estimate.confidence)
+            interval = low, failures.add_missed(terms, high, estimate.confidence)
         points = int(np.count_nonzero(labels == kind))
         shares[kind] = Share(p=p, interval=interval, cov=cov, of_failures=p / estimate.p, points=points)
     if len(shares) == 1:  # all of p: its interval is that of p
