@@ -154,6 +154,30 @@ def format_few() -> Iterator[str]:
     )
 
 
+def format_strata() -> Iterator[str]:
+    """Yield the section of sums over strata."""
+    record = read("strata")
+    yield f"## Sums over strata\n\n`{record['command']}`: three strata with known p."
+    yield "Coverages of 0.93 are those of 0.95 by chance; *whole* is the error of plain Monte Carlo on the mixture.\n"
+    yield format_table(
+        ("shares", "p", "method", "simulations", "coverage", "low : high", "bias", "error (own)", "whole"),
+        (
+            (
+                ", ".join(f"{share:.3g}" for share in case["shares"]),
+                ", ".join(f"{p:g}" for p in case["p"]),
+                f"`{case['method']}`" + (f" x {case['replicates']}" if case["replicates"] > 1 else ""),
+                f"{case['n_sim']:,.0f}" + (f", c.o.v. {case['target_cov']:g}" if case["target_cov"] else ""),
+                f"{case['coverage']:.3f}",
+                f"{case['below']} : {case['above']}",
+                f"{case['bias']:+.3f} ± {case['bias_error']:.3f}",
+                f"{case['error']:.3f} ({case['own']:.3f})",
+                f"{case['whole']:.2f}",
+            )
+            for case in record["cases"]
+        ),
+    )
+
+
 def _format_cov(row: Mapping[str, Any]) -> str:
     """Return the spread over seeds and what runs state, an en dash where a run does not know it."""
     shown = ["–" if row[key] is None else f"{row[key]:.3f}" for key in ("cov", "own_cov")]
@@ -261,6 +285,7 @@ def format_page() -> str:
         format_traffic(),
         format_known(),
         format_few(),
+        format_strata(),
         format_bases(),
         format_egos(frozenset(rare_envs.ENV_IDS)),
         format_papers(),
