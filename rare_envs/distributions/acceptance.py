@@ -160,7 +160,7 @@ class AcceptedGaps:
         for rows in self._closing_rows(z[:, self._speed]):
             given = self._given(z[rows])
             u[rows, self._gap] = given.to_normal(np.log(z[rows, self._gap]))
-        return u
+        return np.clip(u, -MAX_U, MAX_U)  # the ego's range is a point where it closes at its top speed
 
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
         """Map standard normal points to points in the box, (n, d) -> (n, d).

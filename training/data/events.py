@@ -222,8 +222,7 @@ def measure_answer(position: FloatArray, speed: FloatArray, at: int) -> tuple[fl
         reach = min(MEAN_REACH, len(speed) - 1 - later)
         mean = (speed[later - reach : later + reach + 1].mean() - speed[at]) / MEAN_SECONDS
     if last < len(position):
-        slope = np.gradient(np.gradient(smooth_positions(position, CUTOFF_ALONG), DT), DT)
-        braking = max(-slope[at : last + 1].min(), 0.0)
+        braking = max(-_smooth_motion(position)[1][at : last + 1].min(), 0.0)
     return float(mean), float(braking)
 
 
@@ -290,6 +289,12 @@ def write_events(events: Mapping[str, NDArray[Any]], path: Path | str) -> None:
     csv.write_csv(pa.table(columns), path)
 
 
+def _smooth_motion(position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return speed and acceleration of smoothed positions along the road, (T,) each [m/s, m/s^2]."""
+    speed = np.gradient(smooth_positions(position, CUTOFF_ALONG), DT)
+    return speed, np.gradient(speed, DT)
+
+
 def find_brakings(position: FloatArray, gap: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return speed and gap at the beginning, peak deceleration and loss of speed of brakings (n, 4), and onsets.
 
@@ -302,8 +307,7 @@ def find_brakings(position: FloatArray, gap: FloatArray) -> tuple[FloatArray, ND
     """
     events, onsets = [], []
     if len(position) >= SHORTEST_TRACK:
-        speed = np.gradient(smooth_positions(position, CUTOFF_ALONG), DT)
-        acceleration = np.gradient(speed, DT)
+        speed, acceleration = _smooth_motion(position)
         braking = acceleration < -BRAKING_ONSET
         braking[:END_TICKS] = braking[len(braking) - END_TICKS :] = False
         edges = np.flatnonzero(np.diff(braking.astype(np.int8))) + 1
