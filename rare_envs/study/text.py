@@ -125,8 +125,9 @@ def tabulate_events(events: Sequence[EventRate]) -> list[str]:
     rows = [("", "per km", "per event", "per million km", "people in them", "human model")]
     for each in events:
         rate = each.rate
-        high = "" if rate.determined or rate.interval is None else f"below {rate.interval[1] / each.share:.1e}"
-        numbers = format_rate(rate.frequency.per_km * each.share), high or f"{rate.p / each.share:.1e}"
+        found = rate.p if rate.p > 0 or rate.interval is None else rate.interval[1]
+        p = f"{'below ' if rate.p == 0 else ''}{found / each.share:.1e}"
+        numbers = format_rate(rate.frequency.per_km * each.share), p
         ego = format_with_interval(rate.per_million_km, rate.interval_per_million_km)
         name = EVENT_NOUNS.get(each.event, each.event)
         rows.append((name, *numbers, ego, describe_people(each.people), describe_model(each)))
