@@ -288,7 +288,8 @@ def save_risk_plot(
 def _name_row(each: EventRate) -> str:
     """Return an event in words, and whether its rate is calibrated."""
     name = EVENT_NOUNS.get(each.event, each.event)
-    return f"{name}\n({each.uncalibrated})" if each.uncalibrated else name
+    why = each.uncalibrated if each.calibration is not None else "no calibration"  # without a file's long name
+    return f"{name}\n({why})" if why else name
 
 
 def draw_rates(axes: Axes, rows: Sequence[tuple[str, float, RateInterval, HumanBenchmark | None]]) -> None:
