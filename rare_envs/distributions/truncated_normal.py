@@ -57,6 +57,7 @@ class TruncatedConditional:
 
     def to_normal(self, x: FloatArray) -> FloatArray:
         """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
+        x = np.clip(x, self.low, self.high)  # rounding may have led beyond an end
         below, above = (self._log_tail(x, np.full(len(x), side)) for side in (True, False))
         tail = np.minimum(below, above) - np.logaddexp(below, above)
         return cast(FloatArray, np.where(below <= above, 1.0, -1.0) * ndtri_exp(tail))

@@ -160,3 +160,13 @@ def test_normals_of_a_file_are_the_same_block_in_all_refits_and_their_ends_have_
     assert pool.blocks[1] is base.refits[0].blocks[1]
     u = CutNormals([-np.inf, LIMIT], [LIMIT, 2.0]).to_standard_normal([[LIMIT, LIMIT], [LIMIT, 2.0]])
     assert np.isfinite(u).all() and (np.abs(u) > 7.0).all()
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v1", "rare_envs/HardBrake-v0"])
+def test_points_far_out_go_there_and_back_as_finite_numbers(env_id: str) -> None:
+    """Searches go there: 2,000 points up to 12 and 38 standard deviations out in each direction."""
+    base = load_base(scenario_named(env_id), "us101")
+    u = np.random.default_rng(0).uniform(-1.0, 1.0, (2000, base.low.size)) * np.repeat([12.0, 38.0], 1000)[:, None]
+    x = base.from_standard_normal(u)
+    assert ((x >= base.low) & (x <= base.high)).all()
+    assert np.isfinite(base.to_standard_normal(x)).all() and not np.isnan(base.log_prob(x)).any()
