@@ -77,9 +77,10 @@ def load_ego(
     Args:
         spec: "idm"; "human", an attentive human driver, or "human:no-headway-rule", who looks away for as long as it
             likes; all with other parameters as "idm?time_headway=2&exponent=2" (fields of `rare_envs.IDM` and
-            `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
-            ego with lidar; "vision", PilotNet on the front camera; "mgail" or "gail", drivers of the traffic,
-            by their mean actions ("mgail?rules=0" by its network alone); a path to a `.safetensors` with one of these
+            `rare_envs.control.human_driver.HumanDriverModel`; a longer `reaction_time` alone makes contacts 100 to 300
+            times as frequent, which people's are not); "imitation", the shipped ego with lidar; "vision", PilotNet on
+            the front camera; "mgail" or "gail", drivers of the traffic, by their mean actions ("mgail?rules=0" by its
+            network alone); a path to a `.safetensors` with one of these
             kinds, to a `.zip` saved by Stable-Baselines3, or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form);
             "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub; `module:function`, a function without arguments
             that returns an ego (modules in the working directory are found); `tcp://host:port` for an ego in another
