@@ -30,7 +30,7 @@ def run(tmp_path_factory):
 
 def test_members_differ_and_the_driver_is_saved_with_their_distribution(run, monkeypatch):
     fit = module.fit_weights
-    monkeypatch.setattr(module, "fit_weights", lambda members: fit(members, penalties=(0.8,)))
+    monkeypatch.setattr(module, "fit_weights", lambda members: fit(members, penalties=(0.8,), folds=2))
     members = train_members(run, FEW)
     weights = np.stack([member.weights for member in members])
     base = read_driver(run / DRIVER)
