@@ -308,6 +308,9 @@ class DrivingProblem:
         """
         measurement = Measurement("ttc", self.world.measurement.collisions, statistics=True)
         world, x = replace(self.world, measurement=measurement), self.space.validate(np.atleast_2d(x))
+        if not len(x):
+            none, pairs = torch.empty(0), torch.empty(0, 2)
+            return Crash(none.long(), pairs.long(), none, none, pairs, pairs)
         parts = [end.statistics.crash for end in self._roll_out(world, x, None) if end.statistics is not None]
         return Crash(*(torch.cat(values).cpu() for values in zip(*parts, strict=True)))
 

@@ -39,6 +39,12 @@ def test_braking_and_accelerating_egos() -> None:
     assert (throttle == -1.0).all()
 
 
+def test_no_scenarios_have_no_outcomes() -> None:
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")
+    none = np.empty((0, 3))
+    assert (problem.evaluate(none).shape, problem.crash_kinds(none)) == ((0,), [])
+
+
 def test_policies_are_asked_in_fixed_tiles() -> None:
     ego = Constant([-1.0, 0.0])
     problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, horizon=0.1)
