@@ -165,6 +165,8 @@ class AcceptedGaps:
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
         """Map standard normal points to points in the box, (n, d) -> (n, d).
 
+        u -> x -> u returns to 1e-9 for |u| <= 5; farther out floats beside an end of the box are further apart.
+
         Raises:
             ValueError: Wrong shape, or u is not finite.
         """
