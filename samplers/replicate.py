@@ -215,12 +215,13 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     trace = tuple(replace(level, run=i) for i, outcome in enumerate(outcomes) for level in outcome.trace)
     if outcomes[0].parts:
         same = [list(parts) for parts in zip(*(outcome.parts for outcome in outcomes), strict=True)]
-        wholes = [replace(combine([part.outcome for part in parts], confidence), trace=()) for parts in same]
+        wholes = [replace(combine(_list_known(parts), confidence), trace=()) for parts in same]
         counts_of = [sum(part.n_sim for part in parts) for parts in same]
         added = zip(outcomes[0].parts, wholes, counts_of, strict=True)
         return sum_strata([replace(part, outcome=whole, n_sim=n) for part, whole, n in added], confidence, trace)
-    counts = pool_counts(outcomes)
-    used = outcomes if counts else [each for each in outcomes if each.status is not Status.STOPPED] or outcomes
+    ended = [each for each in outcomes if each.status is not Status.STOPPED] or outcomes
+    used = outcomes if pool_counts(outcomes) else ended
+    counts = pool_counts(used)
     shares = [each.counts[1] / counts[1] if counts and each.counts else 1 / len(used) for each in used]
     remarks, weights = _collect_texts([each.remarks for each in used]), _share_weights(outcomes, used, shares)
     if counts:
@@ -249,6 +250,12 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         base_draws=sum(outcome.base_draws for outcome in used),
         draw_weights=weights,
     )
+
+
+def _list_known(parts: Sequence[Part]) -> list[Outcome]:
+    """Return the outcomes of a stratum in several runs; one that has not simulated it beside others is as stopped."""
+    some = any(part.n_sim for part in parts)
+    return [replace(part.outcome, status=Status.STOPPED) if some and not part.n_sim else part.outcome for part in parts]
 
 
 def pool_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:

@@ -171,7 +171,13 @@ class Estimate(EstimateData, Kept):
         again = self.method.stops_at_target and self.sample is not None
         draws = self.sample.n_units if again and self.sample is not None else None
         return Pilot(
-            method=self.method.name, p=self.p, cov=self.cov, n_sim=self.n_sim, final_draws=draws, seconds=seconds
+            method=self.method.name,
+            p=self.p,
+            cov=self.cov,
+            n_sim=self.n_sim,
+            final_draws=draws,
+            seconds=seconds,
+            strata=tuple((part.share, part.p) for part in self.parts),
         )
 
     def shares(self, label: Callable[[FloatArray], Sequence[str]], most: int | None = None) -> dict[str, Share]:

@@ -130,7 +130,10 @@ class _Sum:
         for task in self._plan_plain_draws():
             if not self.stopped:
                 yield from self._run(*task)
-        return sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
+        whole = sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
+        for last in self.trace[-1:]:  # levels of a run do not know the pilot
+            self.goal.on_level(replace(last, estimate=whole.p))
+        return whole
 
     def _plan_pilots(self) -> list[Task]:
         """Return a first run for every stratum, or for the largest ones where there are fewer simulations."""
@@ -280,8 +283,9 @@ class _Sum:
             high = max(clopper_pearson(0, drawn, self.goal.confidence)[1], old.p)
             return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
         if found.p == 0 == old.p:
+            about = f"None of {drawn:,} base draws failed: p = 0 with a one-sided interval."
             interval = clopper_pearson(0, drawn, self.goal.confidence)
-            return replace(found, interval=interval, base_draws=drawn), n
+            return replace(found, interval=interval, base_draws=drawn, warnings=(about,)), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost
             return dilute(old, found, n_old / (n_old + n)), n_old + n
         return replace(found, base_draws=drawn), n

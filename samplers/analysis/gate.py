@@ -153,6 +153,8 @@ class Pilot:
     """Draws behind p, if the method goes on with them until a target is met; None if it makes further runs."""
     seconds: float | None = None
     """Wall time [s], where it is known."""
+    strata: tuple[tuple[float, float], ...] = ()
+    """Share and p of each stratum of a sum."""
 
     def __post_init__(self) -> None:
         """Check that there is something to plan from."""
@@ -205,7 +207,10 @@ def plan_runs(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
         own = pilot.n_sim - pilot.final_draws + pilot.final_draws * factor
     else:
         own = float(pilot.n_sim) * (1.0 if factor <= 1.0 else max(MIN_RUNS, math.ceil(factor)))
-    needed = {pilot.method: own, "mc": (1.0 - pilot.p) / (pilot.p * target_cov**2)}
+    spread = math.sqrt(pilot.p * (1.0 - pilot.p))
+    if pilot.strata:  # plain draws in proportion to w_k times the standard deviation (Neyman, 1934)
+        spread = math.fsum(share * math.sqrt(p * (1.0 - p)) for share, p in pilot.strata)
+    needed = {pilot.method: own, "mc": (spread / (pilot.p * target_cov)) ** 2}
     rate = None if pilot.seconds is None else pilot.seconds / pilot.n_sim
     counts = {name: max(1, math.ceil(n * (1.0 - 1e-12))) for name, n in needed.items()}  # rounding of the division
     return tuple(

@@ -308,6 +308,21 @@ def test_replicates_of_counts_are_pooled_by_stratum():
     assert result.interval[1] / result.interval[0] < 1.2  # a t interval of 4 runs would be twice as wide
 
 
+def test_a_stratum_that_a_replicate_has_not_simulated_does_not_count_in_it():
+    always = FunctionProblem(lambda x: -np.ones(len(x)), 1)
+    problem = StratifiedProblem([Stratum(*each, always) for each in (("a", 0.5), ("b", 0.3), ("c", 0.2))])
+    result = samplers.estimate(problem, "mc", seed=0, max_sim=5, replicates=2)  # 2 and 3 simulations
+    assert [part.p for part in result.parts] == [1.0, 1.0, 1.0] and [part.n_sim for part in result.parts] == [2, 2, 1]
+
+
+def test_a_plan_takes_plain_draws_by_stratum():
+    """Neyman: n = (sum of w_k sqrt(p_k (1 - p_k)))^2 / (p t)^2."""
+    result = samplers.estimate(even((0.9, 0.1), (40.0, 1.0)), "mc", seed=0, max_sim=4000)
+    (run,) = samplers.plan_runs(result.pilot(), target_cov=0.1)
+    p = result.parts[1].p
+    assert run.n_sim == math.ceil((1 - p) / p / 0.01)
+
+
 def test_levels_and_warnings_name_their_stratum():
     result = samplers.estimate(roads(), "adss", seed=1, max_sim=3000)
     assert {level.stratum for level in result.trace} == set(SHARES)
