@@ -14,7 +14,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
-from training.fit.checks import check_predictions, mass_outside
+from training.fit.checks import check_predictions
 from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
     N_FOLDS,
@@ -135,7 +135,7 @@ def _fit_in_best_system(scenario: str, events: EventSet, system: str | None, ask
         family=describe_family(chosen.family, refits),
         checks=check_predictions(found.name, names, events.joint, chosen.distribution, asked.seed),
         criteria={name: selection[best][name] for name in ("coordinates", "bic", "held_out_log_prob")},
-        entries={"selection": selection, "mass_outside_box": mass_outside(chosen.distribution)},
+        entries={"selection": selection},
         settings=SETTINGS,
     )
 

@@ -18,15 +18,12 @@ from numpy.typing import NDArray
 
 import rare_envs
 from rare_envs.distributions.events import PredictiveCheck
-from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution
 from rare_envs.simulation.world import drive
 from samplers.problem import FloatArray
 from training.data.events import ANSWER_SECONDS, MEAN_SECONDS
 from training.data.table import DT
 
-MASS_SAMPLES = 1_000_000
-"""Draws from which the mass outside the box is estimated."""
 CHECK_DRAWS = 200_000
 """Draws from which an expected count is computed; one in 2,000 events then has an error of 10 %."""
 HARD_NEED = 4.9
@@ -93,27 +90,6 @@ def check_predictions(
         words = "{}" if len(groups) == 1 else f"{{}}, {group[2]}"
         checks += check_states(DANGEROUS_STATES, words, events[:, columns], drawn[:, columns])
     return checks
-
-
-def mass_outside(distribution: TruncatedGaussianMixture, seed: int = 0) -> dict[str, Any]:
-    """Return the probability that the box cuts away from the mixture, by any column and by each."""
-    coordinates, rng = distribution.coordinates, np.random.default_rng(seed)
-    counts = rng.multinomial(MASS_SAMPLES, distribution.weights)
-    parts = [
-        mean + rng.standard_normal((count, distribution.dim)) @ np.linalg.cholesky(covariance).T
-        for count, mean, covariance in zip(counts, distribution.means, distribution.covariances, strict=True)
-    ]
-    y = np.concatenate(parts)
-    x = np.empty_like(y)
-    for position, j in enumerate(coordinates.columns):
-        x[:, j] = coordinates.value(j, y[:, position], x)
-    outside = (x < coordinates.low) | (x > coordinates.high)
-    p = float(outside.any(axis=1).mean())
-    return {
-        "any": p,
-        "standard_error": float(f"{np.sqrt(p * (1.0 - p) / MASS_SAMPLES):.2g}"),
-        "each": [float(f"{value:.3g}") for value in outside.mean(axis=0)],
-    }
 
 
 HARD_BRAKING = 3.4

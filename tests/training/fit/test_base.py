@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from training.fit.base import fit_base, format_base
-from training.fit.checks import CHECK_DRAWS, check_predictions, mass_outside
+from training.fit.checks import CHECK_DRAWS, check_predictions
 from training.fit.filters import EventSet
 
 FREQUENCY = EventFrequency(count=60, hours=6.0, km=200.0, definition="a pair begins", source="made up")
@@ -24,21 +23,6 @@ def fitted(n=60, **changes):
     x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])
     events = EventSet(x, np.arange(n) // 4, cluster="scene")
     return fit_base("car_following", events, SOURCE, "by hand", frequency=FREQUENCY, n_refits=3, **changes)
-
-
-def test_mass_outside_of_a_closing_speed():
-    """Speed 10, gap e^2, closing speed N(0, 1) e: ahead below 0 where the closing speed is above 10 / e."""
-    closing = Coordinates(
-        low=[0.0, 0.0, 1.0],
-        high=[45.0, 45.0, 150.0],
-        kinds=("plain", ClosingSpeed("v", "gap"), "log"),
-        names=("v", "ahead", "gap"),
-        order=("v", "gap", "ahead"),
-    )
-    tight = np.diag([1e-12, 1e-12, 9.0])
-    mass = mass_outside(TruncatedGaussianMixture([1.0], [[10.0, 2.0, 0.0]], [tight], coordinates=closing))
-    expected = 0.1100  # Phi(-10 / (3 e)); 35 m/s faster has probability 1e-5
-    assert mass["each"][1] == pytest.approx(expected, abs=4.0 * mass["standard_error"] + 1e-4)
 
 
 def test_a_base_carries_all_that_says_what_it_is_worth_and_so_does_its_file(quick, tmp_path):
