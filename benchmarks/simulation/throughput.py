@@ -10,7 +10,6 @@ import json
 import resource
 import shutil
 import subprocess
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +24,6 @@ import rare_envs
 import samplers
 from benchmarks.samplers.runs import about
 from benchmarks.simulation import highway_env_reference as reference
-from benchmarks.simulation.bound import bound_rate, measure_machine
 from benchmarks.simulation.timing import seconds
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import use_one_thread
@@ -63,8 +61,8 @@ FLOORS = {
     "highway_1024": 200.0,
 }
 """Least ratios to HighwayEnv."""
-COUNTED = 256
-"""Rollouts whose arithmetic is counted."""
+CORES = {"torch": "", "numba": "_compiled"}
+"""Cores, and endings of the names of their results."""
 BATCHES = (1, 64, 256, 512, 1024)
 """Batch sizes of the highway."""
 CEILINGS = {
@@ -288,31 +286,6 @@ def memory(rollouts: int = 1_000_000) -> dict[str, float]:
     return {"rollouts": rollouts, "seconds": elapsed, "peak_gib": _peak_gib()}
 
 
-def count_bound(machine: Mapping[str, float], env_id: str, **settings: Any) -> float:
-    """Return the rollouts a second that one core allows.
-
-    Args:
-        machine: Rates of `measure_machine`.
-        env_id: Of the problem whose arithmetic is counted.
-        **settings: Of this problem.
-    """
-    plain = rare_envs.DrivingProblem(env_id, core="torch", **settings)
-    x = plain.base.sample(COUNTED, np.random.default_rng(0))
-    plain.evaluate(x[:2])  # what is computed once is not counted
-    return bound_rate(plain.evaluate, x, machine)
-
-
-def count_highway_bound(machine: Mapping[str, float]) -> float:
-    """Return the seconds of highway traffic a second that one core allows; arguments as of `count_bound`."""
-    seconds_of_traffic = rare_envs.DrivingProblem(HIGHWAY).world.clock.seconds
-    return seconds_of_traffic * count_bound(machine, HIGHWAY, measure="lidar_ttc")
-
-
-def stand_by_bound(row: dict[str, float], bound: float) -> dict[str, float]:
-    """Return a row with the rate that one core allows, in the unit of its own, and the share of it that was reached."""
-    return {**row, "bound_per_second": bound, "of_bound": row["per_second"] / bound}
-
-
 def _compare_rates(ours: list[float], theirs: list[float]) -> dict[str, float]:
     ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
     return {
@@ -333,49 +306,40 @@ def main(
 ) -> None:
     """Measure everything, print a table, and fail if a floor is missed."""
     results: dict[str, dict[str, float]] = {}
-    machine = measure_machine()
     if not only_camera:
         results = {"highway_memory": highway_memory()}  # first: a peak stays
-        bound = count_highway_bound(machine)
         for batch in BATCHES:
-            results[f"highway_{batch}"] = stand_by_bound(measure_highway(batch, rounds), bound)
+            results[f"highway_{batch}"] = measure_highway(batch, rounds)
     results["camera_64"] = measure_camera(64, rounds)
     results["camera_64_weather"] = measure_camera(64, rounds, weather=True)
     if not only_camera:
-        named = {"car_following": CAR_FOLLOWING, "cut_in": CUT_IN, "cut_in_v1": CUT_IN_V1}
-        scripts = {env_id: count_bound(machine, env_id, horizon=HORIZON) for env_id in named.values()}
-        for name, env_id in named.items():
-            for core, ending in (("torch", ""), ("numba", "_compiled")):
-                row = rollout_ratio(env_id, core, rounds)
-                results[f"{name}_idm{ending}"] = stand_by_bound(row, scripts[env_id])
+        for name, env_id in (("car_following", CAR_FOLLOWING), ("cut_in", CUT_IN), ("cut_in_v1", CUT_IN_V1)):
+            for core, ending in CORES.items():
+                results[f"{name}_idm{ending}"] = rollout_ratio(env_id, core, rounds)
             if env_id in ANSWER_BASES:
                 results[f"answer_{name}"] = measure_answer(env_id, rounds)
-        bound = count_bound(machine, CAR_FOLLOWING, ego=ppo(CAR_FOLLOWING), horizon=HORIZON)
-        for core, ending in (("torch", ""), ("numba", "_compiled")):
-            results[f"car_following_ppo{ending}"] = stand_by_bound(policy_ratio(core, rounds), bound)
-        for name, row, env_id in (
-            ("env_step", step_ratio(500), CAR_FOLLOWING),
-            ("vec_step", batch_step_ratio(CAR_FOLLOWING, 200), CAR_FOLLOWING),
-            ("vec_step_cut_in_v1", batch_step_ratio(CUT_IN_V1, 200), CUT_IN_V1),
-        ):
-            results[name] = stand_by_bound(row, TICKS * scripts[env_id])
+        for core, ending in CORES.items():
+            results[f"car_following_ppo{ending}"] = policy_ratio(core, rounds)
+        results["env_step"] = step_ratio(500)
+        results["vec_step"] = batch_step_ratio(CAR_FOLLOWING, 200)
+        results["vec_step_cut_in_v1"] = batch_step_ratio(CUT_IN_V1, 200)
         if with_memory:
             results["memory"] = memory()
     missed = [name for name, row in results.items() if not judge(name, row)]
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"machine": describe_run(machine), "results": results}, indent=2) + "\n")
+    out.write_text(json.dumps({"machine": describe_run(), "results": results}, indent=2) + "\n")
     print(f"Wrote {out}")
     if missed:
         print(f"Missed: {', '.join(missed)}")
         raise typer.Exit(1)
 
 
-def describe_run(rates: Mapping[str, float]) -> dict[str, Any]:
-    """Return the machine with its rates of arithmetic, the versions and the commit; an empty one outside a checkout."""
+def describe_run() -> dict[str, Any]:
+    """Return the machine, the versions and the commit; an empty one outside a checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
     has_git = shutil.which("git") is not None
     commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() if has_git else ""
-    return {**about(torch=torch.__version__, rare_envs=rare_envs.__version__, commit=commit), "rates": dict(rates)}
+    return about(torch=torch.__version__, rare_envs=rare_envs.__version__, commit=commit)
 
 
 def judge(name: str, row: dict[str, float]) -> bool:
@@ -391,7 +355,6 @@ def judge(name: str, row: dict[str, float]) -> bool:
         value, limit, words = row["ratio"], FLOORS[name], "times HighwayEnv"
         kept = value >= limit
     further = f", {row['per_second']:,.0f} times real time" if "batch" in row else ""
-    further += f", {100 * row['of_bound']:.2g} % of this core's bound" if "of_bound" in row else ""
     print(f"{name:28s} {value:8.3g} {words} ({'floor' if name in FLOORS else 'ceiling'} {limit:g}){further}")
     return kept
 
