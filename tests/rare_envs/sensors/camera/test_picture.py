@@ -37,7 +37,13 @@ SCENES = [
 ]
 
 
-@pytest.mark.parametrize("number", [0, 2, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, *range(3, len(SCENES))))])
+QUICK = (0, 2)
+"""Scenes of the default suite."""
+
+
+@pytest.mark.parametrize(
+    "number", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in range(len(SCENES))]
+)
 def test_equal_to_the_slow_renderer_within_rounding(number: int) -> None:
     road, camera, sky = SCENES[number]
     rng = np.random.default_rng(number)
