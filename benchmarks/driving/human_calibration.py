@@ -3,10 +3,11 @@
     python -m benchmarks.driving.human_calibration [--draws 1000000] [--workers 2] [--ego ppo.zip]
 
 drives draws of each stratum (cutters who looked, cutters who did not, leads that stop, leads that slow) with the human
-driver model, its bracket, the IDM and the shipped egos, and counts contacts and near-crashes (`near_crash`); takes away
-parts of the model one at a time; compares per event and per million km with people's counts by precipitating event
-(`rare_envs.people.people_in`); and says which targets are met. It writes benchmarks/results/human_calibration.json,
-rare_envs/data/human_calibration.json (what the package prints beside rates) and the end of docs/human_driver.md.
+driver model with and without its headway rule, the IDM and the shipped egos, and counts contacts and near-crashes
+(`near_crash`); takes away parts of the model one at a time; compares per event and per million km with people's counts
+by precipitating event (`rare_envs.people.people_in`); and says which targets are met. It writes
+benchmarks/results/human_calibration.json, rare_envs/data/human_calibration.json (what the package prints beside rates)
+and the end of docs/human_driver.md; with --no-drive from the cells of the last run.
 
 People's counts are those of all roads; how often the events happen is the `EventFrequency` of the base distribution. No
 constant of the model or of the scenarios may be changed because of what is printed here without saying so on the page.
@@ -50,7 +51,7 @@ CALIBRATION_OF_PACKAGE = Path(rare_envs.people.__file__).parent / "data" / "huma
 PAGE, MEASURED = Path("docs/human_driver.md"), "## Measured"
 CONFIDENCE = 0.95
 CUT_IN, HARD_BRAKE = "rare_envs/CutIn-v1", "rare_envs/HardBrake-v0"
-HUMAN, BRACKET = "human", "human:no-headway-rule"
+HUMAN, NO_HEADWAY_RULE = "human", "human:no-headway-rule"
 
 
 class Stratum(NamedTuple):
@@ -69,6 +70,8 @@ STRATA: Mapping[str, Stratum] = {
     "stop": Stratum(HARD_BRAKE, "stop", "leads that stop", 1.0),
     "slowing": Stratum(HARD_BRAKE, "slowing", "leads that slow", 1.0),
 }
+EVENT_WORDS: Mapping[Event, str] = {"cut_in": "cut-in", "stop": "lead that stops", "slowing": "lead that slows"}
+OUTCOMES: tuple[Outcome, Outcome] = ("contacts", "near_crashes")
 WITHIN: Mapping[Event, float] = {"cut_in": 3.0, "stop": 3.0, "slowing": 5.0}
 """Factors within which `human` has to meet people's intervals."""
 
@@ -114,10 +117,10 @@ CHANGES: Mapping[str, Change] = {
     "never noticed": Change(("unseen",), {}, {"oblivious": 1.0}),
 }
 """Parts by name; "" is the model as it is. Of a change other than it, `CHANGED_SHARE` of the draws are driven."""
-CHANGED_SHARE = 0.3
-EGOS: Mapping[str, float] = {HUMAN: 1.0, BRACKET: 1.0, "idm": 1.0, "imitation": 0.03, "vision": 1e-4}
-"""Egos, and their share of the draws: networks are slow, cameras take a quarter of a second. Those that get less than
-all of them are driven at the first site alone."""
+CHANGED_SHARE = 0.1
+EGOS: Mapping[str, float] = {HUMAN: 1.0, NO_HEADWAY_RULE: 1.0, "idm": 1.0, "imitation": 0.03}
+"""Egos, and their share of the draws: networks are slow, and `vision`, a quarter of a second a drive, is too slow for
+counts like these. Those that get less than all of them are driven at the first site alone."""
 OWN_EGO_SHARE = 0.02
 CHUNK = 20_000
 
@@ -179,8 +182,9 @@ class CalibrationCell:
         """Near-crashes of either kind."""
         return self.counter + self.evaded
 
-    def probability(self, count: int) -> ModelCount:
-        """Return the probability of what was counted, with its exact interval."""
+    def probability(self, outcome: Outcome) -> ModelCount:
+        """Return the probability of contacts or near-crashes with its exact interval."""
+        count = getattr(self, outcome)
         return ModelCount(count / self.draws, *clopper_pearson(count, self.draws, CONFIDENCE))
 
 
@@ -198,9 +202,9 @@ def make_problem(drawn: Drawn) -> rare_envs.DrivingProblem:
 
 
 def find_stratum(base: Any, name: str) -> Any:
-    """Return a stratum of a base distribution; the distribution itself where it has none."""
-    strata = getattr(base, "strata", None) or ()
-    return next((each.base for each in strata if each.name == name), base)
+    """Return a stratum of a base distribution; the distribution itself where it has none, as test distributions."""
+    strata = {each.name: each.base for each in getattr(base, "strata", None) or ()}
+    return strata[name] if strata else base
 
 
 def run(job: Job) -> Counter[int]:
@@ -288,37 +292,32 @@ def calibrate(cells: Sequence[CalibrationCell], site: str) -> dict[Event, EventC
     """Return contacts and near-crashes of each ego per event, and people's, of the cells without changes."""
     found: dict[Event, EventCalibration] = {}
     for event, (per_km, shares) in find_events(site).items():
-        drivers: dict[str, dict[Outcome, ModelCount]] = {}
+        drivers: dict[str, dict[str, ModelCount]] = {}
         for ego in dict.fromkeys(cell.ego for cell in cells):
             own = {c.stratum: c for c in cells if (c.site, c.ego, c.change) == (site, ego, "") and c.stratum in shares}
             if set(own) == set(shares):
                 drivers[ego] = {
-                    "contacts": add([(w, own[name].probability(own[name].contacts)) for name, w in shares.items()]),
-                    "near_crashes": add(
-                        [(w, own[name].probability(own[name].near_crashes)) for name, w in shares.items()]
-                    ),
+                    outcome: add([(w, own[name].probability(outcome)) for name, w in shares.items()])
+                    for outcome in OUTCOMES
                 }
         found[event] = EventCalibration(event=event, base=site, per_km=per_km, drivers=drivers)
     return found
 
 
 def to_package(cells: Sequence[CalibrationCell], sites: Sequence[str], command: str) -> dict[str, Any]:
-    """Return what `rare_envs.people.calibration` reads, by event and base: the bracket alone."""
+    """Return what `rare_envs.people.calibration` reads, by event and base: the human drivers alone."""
     events: dict[Event, dict[str, Any]] = {event: {} for event in EVENT_WORDS}
     for site in sites:
         for event, each in calibrate(cells, site).items():
             counts = {
                 ego: {outcome: [float(f"{value:.3g}") for value in of] for outcome, of in each.drivers[ego].items()}
-                for ego in (HUMAN, BRACKET)
+                for ego in (HUMAN, NO_HEADWAY_RULE)
             }
             events[event][site] = {"per_km": each.per_km, "drivers": counts}
     return {"command": command, "events": events}
 
 
 # --- the page -----------------------------------------------------------------------------------
-
-EVENT_WORDS: Mapping[Event, str] = {"cut_in": "cut-in", "stop": "lead that stops", "slowing": "lead that slows"}
-OUTCOMES: tuple[Outcome, Outcome] = ("contacts", "near_crashes")
 
 
 def show(p: ModelCount, scale: float = 1.0, digits: str = ".1e") -> str:
@@ -327,14 +326,11 @@ def show(p: ModelCount, scale: float = 1.0, digits: str = ".1e") -> str:
     return f"{scale * p.p:{digits}} [{low:{digits}},{high:{digits}}]" if p.p > 0 else f"<{high:{digits}}"
 
 
-def people_count(each: EventCalibration, outcome: Outcome) -> ModelCount:
-    """Return people's probability per event in the same form."""
-    p, (low, high) = each.people(outcome)
-    return ModelCount(p, low, high)
-
-
 def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[str]:
-    """Return the tables of egos and people, per event and per million km."""
+    """Return the tables of egos and people, per event and per million km.
+
+    Egos are left out who had nothing, and whose draws are too few to tell them from people.
+    """
     lines = [f"### {site}", ""]
     for event, each in found.items():
         scale = MILLION_KM * each.per_km
@@ -344,11 +340,13 @@ def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[st
             "| | contacts | near-crashes | contacts per million km | near-crashes per million km |",
             "|---|---|---|---|---|",
         ]
-        rows = {**each.drivers, "**people**": {outcome: people_count(each, outcome) for outcome in OUTCOMES}}
-        for ego, of in rows.items():
-            values = [show(of[outcome]) for outcome in OUTCOMES]
-            values += [show(of[outcome], scale, ".2g") for outcome in OUTCOMES]
-            lines.append(f"| {ego} | {' | '.join(values)} |")
+        ends = {outcome: each.people(outcome) for outcome in OUTCOMES}
+        people: dict[str, ModelCount] = {outcome: ModelCount(p, *interval) for outcome, (p, interval) in ends.items()}
+        for ego, of in {**each.drivers, "**people**": people}.items():
+            if any(of[outcome].p > 0 or of[outcome].high < people["near_crashes"].low for outcome in OUTCOMES):
+                values = [show(of[outcome]) for outcome in OUTCOMES]
+                values += [show(of[outcome], scale, ".2g") for outcome in OUTCOMES]
+                lines.append(f"| {ego} | {' | '.join(values)} |")
         lines.append("")
     return lines
 
@@ -357,19 +355,14 @@ def format_changes(cells: Sequence[CalibrationCell], title: str) -> list[str]:
     """Return the table of contacts / near-crashes by part taken away and stratum."""
     lines = [title, "", f"| contacts / near-crashes | {' | '.join(each.words for each in STRATA.values())} |"]
     lines.append("|---" * (len(STRATA) + 1) + "|")
-    found = {(cell.change, cell.stratum): cell for cell in cells}
-    for change in dict.fromkeys(cell.change for cell in cells):
-        row = [found.get((change, name)) for name in STRATA]
-        texts = [
-            "" if c is None else "/".join(_show_count(n, c.draws) for n in (c.contacts, c.near_crashes)) for c in row
-        ]
-        lines.append(f"| {change or 'as it is'} | {' | '.join(texts)} |")
+    found: dict[str, dict[str, str]] = {}
+    for cell in cells:
+        shares = [cell.probability(outcome).p for outcome in OUTCOMES]
+        text = "/".join(f"{p:.1e}" if p > 0 else "0" for p in shares)
+        found.setdefault(cell.change, {})[cell.stratum] = text
+    for change, texts in found.items():
+        lines.append(f"| {change or 'as it is'} | {' | '.join(texts.get(name, '') for name in STRATA)} |")
     return [*lines, ""]
-
-
-def _show_count(count: int, draws: int) -> str:
-    """Return a share of draws; 0 where there is none."""
-    return f"{count / draws:.1e}" if count else "0"
 
 
 def describe_factor(factor: float) -> str:
@@ -379,64 +372,58 @@ def describe_factor(factor: float) -> str:
     return f"{factor:.1f} times its upper end" if factor > 1.0 else f"{1.0 / factor:.1f} times below its lower end"
 
 
-def _list_factors(found: Mapping[Event, EventCalibration]) -> list[str]:
-    """Return by how much `human` misses people, event by event."""
-    return [
-        f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]} {describe_factor(each.factor(outcome))}"
-        for event, each in found.items()
-        for outcome in OUTCOMES
-    ]
-
-
-def judge(found: Mapping[Event, EventCalibration], cells: Sequence[CalibrationCell], site: str) -> list[str]:
-    """Return a sentence for each target, and on what the strata say by themselves."""
+def judge(found: Mapping[Event, EventCalibration]) -> list[str]:
+    """Return a sentence on `human` for each target."""
     told = []
     for event, each in found.items():
-        within = WITHIN[event]
         for outcome in OUTCOMES:
-            factor = each.factor(outcome)
+            factor, within = each.factor(outcome), WITHIN[event]
             met = "met" if 1.0 / within <= factor <= within else "MISSED"
             told.append(
                 f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]}, within a factor of {within:g}: **{met}**, "
-                f"{describe_factor(factor)} (`{BRACKET}`: {describe_factor(each.factor(outcome, BRACKET))})."
+                f"{describe_factor(factor)}."
             )
-    of = {c.stratum: c for c in cells if (c.site, c.ego, c.change) == (site, HUMAN, "")}
-    unseen, cut_ins = of.get("unseen"), found.get("cut_in")
-    if unseen is None or cut_ins is None:
-        return told
-    conflicts = unseen.contacts + unseen.near_crashes
-    low, high = clopper_pearson(unseen.contacts, max(conflicts, 1), CONFIDENCE)
-    told.append(
-        f"Contacts among the conflicts with cutters who had not looked: {low:.1%} to {high:.1%}; people none of 44 own "
-        "and none of 58 sideswipe conflicts, under 3.6 %."
-    )
-    km, near = rare_envs.people.UNSEEN_CHANGES_100CAR, unseen.near_crashes / unseen.draws
-    share = km.per_million_km / MILLION_KM / cut_ins.per_km / near if near > 0 else math.nan
-    shares = find_events(site)["cut_in"][1]
-    told.append(
-        f"The share of cutters who had not looked that gives people's 44 near-crashes in own changes: {share:.1e} "
-        f"(the base has {shares['unseen']:.1e}): what they add to near-crashes is calibrated, not predicted."
-    )
-    scale = people_in("cut_in").near_crashes.miles * rare_envs.people.KM_PER_MILE * cut_ins.per_km
-    own = sum(shares[name] * of[name].counter / of[name].draws for name in shares)
-    theirs = sum(shares[name] * of[name].evaded / of[name].draws for name in shares)
-    told.append(
-        f"By type, in the 100-Car's distance: {scale * own:.0f} near-crashes at cut-ins that the ego avoids (people: "
-        f"74 rear-end), {scale * theirs:.0f} that the cutter avoids (people: 58 sideswipe)."
-    )
     return told
+
+
+def judge_cutters(cells: Sequence[CalibrationCell], site: str) -> list[str]:
+    """Return what the strata of cut-ins say by themselves, with `human`: contacts, share and types of near-crashes."""
+    of = {c.stratum: c for c in cells if (c.site, c.ego, c.change) == (site, HUMAN, "")}
+    if "unseen" not in of:
+        return []
+    (per_km, shares), unseen = find_events(site)["cut_in"], of["unseen"]
+    low, high = clopper_pearson(unseen.contacts, max(unseen.contacts + unseen.near_crashes, 1), CONFIDENCE)
+    near, own_changes = unseen.probability("near_crashes").p, rare_envs.people.UNSEEN_CHANGES_100CAR
+    share = own_changes.per_million_km / MILLION_KM / per_km / near if near > 0 else math.nan
+    events = people_in("cut_in").near_crashes.miles * rare_envs.people.KM_PER_MILE * per_km
+    own, theirs = (
+        events * sum(w * getattr(of[name], kind) / of[name].draws for name, w in shares.items())
+        for kind in ("counter", "evaded")
+    )
+    return [
+        f"Contacts among the conflicts with cutters who had not looked: {low:.1%} to {high:.1%}; people none of 44 "
+        "own and none of 58 sideswipe conflicts, under 3.6 %.",
+        f"P(near-crash | not looked) is {near:.3f}, with which a share of {share:.2e} gives people's 44 near-crashes "
+        f"in own changes (the base has {shares['unseen']:.2e}): what it adds to near-crashes is calibrated.",
+        f"By type, in the 100-Car's distance: {own:.0f} near-crashes at cut-ins that the ego avoids (people: 74 "
+        f"rear-end), {theirs:.0f} that the cutter avoids (people: 58 sideswipe).",
+    ]
 
 
 def format_measured(cells: Sequence[CalibrationCell], sites: Sequence[str], command: str) -> str:
     """Return the measured part of the page."""
-    lines = [MEASURED, "", f"`{command}`; intervals of 95 %, of sampling and of people's counts alone.", ""]
-    first = sites[0]
-    lines += format_events(calibrate(cells, first), first)
-    lines += ["### Targets", "", *(f"* {each}" for each in judge(calibrate(cells, first), cells, first)), ""]
+    lines = [
+        f"{MEASURED}\n",
+        f"`{command}`; intervals of 95 % are of sampling, and of people's counts, alone: the share of cutters who had "
+        "not looked and the frequencies of events count as exact.\n",
+        *format_events(calibrate(cells, sites[0]), sites[0]),
+        "### Targets\n",
+    ]
+    lines += [f"* {each}" for each in (*judge(calibrate(cells, sites[0])), *judge_cutters(cells, sites[0]))]
     for site in sites[1:]:
-        lines += [f"At {site}, of which nothing was chosen: {'; '.join(_list_factors(calibrate(cells, site)))}.", ""]
-    of_human = [c for c in cells if (c.site, c.ego) == (first, HUMAN)]
-    lines += format_changes(of_human, f"### Parts taken away one at a time, `human` on {first}")
+        lines += [f"* At {site}: {each}" for each in judge(calibrate(cells, site))]
+    of_human = [c for c in cells if (c.site, c.ego) == (sites[0], HUMAN)]
+    lines += ["", *format_changes(of_human, f"### Parts taken away one at a time, `human` on {sites[0]}")]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -449,8 +436,7 @@ def write_page(measured: str) -> None:
 def main(
     draws: Annotated[int, typer.Option(help="Draws of `human` where contacts are rarest.")] = 1_000_000,
     site: Annotated[list[str] | None, typer.Option(help="Site; the first one's changes are driven too.")] = None,
-    ego: Annotated[list[str] | None, typer.Option(help="Another ego beside the shipped ones, such as ppo.zip.")] = None,
-    only: Annotated[list[str] | None, typer.Option(help="These egos alone, from `--ego` too.")] = None,
+    ego: Annotated[list[str] | None, typer.Option(help="These egos and not the shipped ones, such as ppo.zip.")] = None,
     changes: Annotated[bool, typer.Option(help="Whether to take parts away.")] = True,
     workers: int = 2,
     seed: int = 0,
@@ -458,8 +444,8 @@ def main(
     write: Annotated[bool, typer.Option(help="Whether to write both files and the page.")] = True,
 ) -> None:
     """Measure, compare with people, and write."""
-    sites, egos = site or ["us101", "i80"], only or [*EGOS, *(ego or [])]
-    options = {"draws": [str(draws)], "site": site or [], "ego": ego or [], "only": only or [], "seed": [str(seed)]}
+    sites, egos = site or ["us101", "i80"], ego or list(EGOS)
+    options = {"draws": [str(draws)], "site": site or [], "ego": ego or [], "seed": [str(seed)]}
     given = "".join(f" --{name} {value}" for name, values in options.items() for value in values)
     command = f"python -m benchmarks.driving.human_calibration{given}"
     if drive:
@@ -474,7 +460,8 @@ def main(
     measured = format_measured(cells, sites, command)
     print(measured)
     if write:
-        told = {"verdicts": judge(calibrate(cells, sites[0]), cells, sites[0]), "cells": [asdict(c) for c in cells]}
+        verdicts = [*judge(calibrate(cells, sites[0])), *judge_cutters(cells, sites[0])]
+        told = {"verdicts": verdicts, "cells": [asdict(c) for c in cells]}
         CALIBRATION_RESULT.write_text(json.dumps({**about, **told}, indent=1) + "\n", encoding="utf-8")
         package = json.dumps(to_package(cells, sites, command), indent=1)
         CALIBRATION_OF_PACKAGE.write_text(package + "\n", encoding="utf-8")

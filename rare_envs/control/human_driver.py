@@ -150,7 +150,7 @@ class HumanDriverModel:
     Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
 
     Raises:
-        ValueError: A parameter is negative or no number.
+        ValueError: A parameter is negative or no number, or the eccentricity above 180 degrees.
 
     Warns:
         UserWarning: The reaction time is above 0.6 s.
@@ -196,8 +196,8 @@ class HumanDriverModel:
     glance_eccentricity: float = 30.0
     """Angle between a glance and the road [deg], by which `seen_expansion_rate` says when looming breaks it off. Beyond
     90 degrees none is broken off. In-car displays are at 20 to 40 degrees, this is the middle of that, assumed for
-    every glance. It hardly matters: without the headway rule 1 of 100,000 stops of the lead ends in contact at 0, 17,
-    20, 30, 40, 63 and 90 degrees alike, and 1,300 do where no glance is broken off."""
+    every glance. It hardly matters: without the headway rule 2 to 3 of 100,000 stops of the lead end in contact at 0,
+    30 and 90 degrees alike, and 1,300 do where no glance is broken off."""
     headway_rule: bool = True
     """Whether a glance is no longer than the headway (gap over own speed) at its beginning less the reaction time.
     That self-paced occlusion grows one to one with headway is Pekkanen et al.'s (2017, in a simulator), that it is
@@ -223,6 +223,8 @@ class HumanDriverModel:
             value = getattr(self, each.name)
             if isinstance(value, int | float) and not value >= 0:
                 raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
+        if self.glance_eccentricity > 180.0:
+            raise ValueError(f"Expected an eccentricity of 0 to 180 degrees, got {self.glance_eccentricity!r}.")
         if self.reaction_time > LONGEST_REACTION:
             warnings.warn(
                 f"reaction_time={self.reaction_time:g} s: above {LONGEST_REACTION} s this model of braking is wrong. "

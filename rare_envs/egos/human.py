@@ -69,8 +69,8 @@ HUMAN_EGOS: Final[Mapping[str, HumanEgo]] = MappingProxyType(
     {"human": HumanEgo(), "human:no-headway-rule": HumanEgo(HumanDriverModel(headway_rule=False))}
 )
 """The human drivers by name, to be printed together: with and without the rule that a glance is no longer than the
-headway, of which no more is known than a simulator study tells. Where looming breaks glances off the rule changes
-little, and both crash because of glances less often than people do."""
+headway, of which no more is known than a simulator study tells. They do not bracket people: looming breaks glances off
+in both, and both crash because of glances less often."""
 
 
 class _Glance(NamedTuple):
