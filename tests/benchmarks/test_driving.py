@@ -11,9 +11,9 @@ import samplers
 from benchmarks.driving import egos, human_calibration
 from benchmarks.driving.egos import evaluate_ego, read_results, write_results
 from benchmarks.driving.human_calibration import (
-    NO_HEADWAY_RULE,
     CALIBRATION_RESULT,
     HUMAN,
+    NO_HEADWAY_RULE,
     STRATA,
     CalibrationCell,
     Drawn,
