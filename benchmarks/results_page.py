@@ -209,16 +209,17 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
         ids: Environments that there are.
     """
     record = read("egos")
-    yield f"## Egos\n\n`{record['command']}`: p of a collision within 10 s by the default method, by plain draws"
-    yield "where an interval begins at 0; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the"
-    yield "base has strata, p in each of them too, or its upper end.\n"
+    yield f"## Egos\n\n`{record['command']}`: p of a collision within 10 s by the default method, `auto`, or by plain"
+    yield "draws, `mc`; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the base has strata, p in"
+    yield "each of them too, or its upper end.\n"
     cells = [cell for cell in record["cells"] if cell["env_id"] in ids]
     yield format_table(
-        ("scenario", "ego", "p", "95 % interval", "strata", "warnings", "likeliest crash"),
+        ("scenario", "ego", "by", "p", "95 % interval", "strata", "warnings", "likeliest crash"),
         (
             (
                 name_of(cell["env_id"]),
                 f"`{cell['ego']}`" + (f", {cell['steps']:,} steps" if cell["steps"] else ""),
+                f"`{cell['method']}`",
                 f"{cell['p']:.1e}" if cell["p"] else "0",
                 f"{cell['low']:.1e} to {cell['high']:.1e}" if cell["low"] else f"below {cell['high']:.1e}",
                 ", ".join(
