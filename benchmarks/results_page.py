@@ -163,13 +163,13 @@ def format_strata() -> Iterator[str]:
         ("shares", "p", "method", "simulations", "coverage", "low : high", "bias", "error (own)", "whole"),
         (
             (
-                ", ".join(f"{share:.3g}" for share in case["shares"]),
-                ", ".join(f"{p:g}" for p in case["p"]),
+                "/".join(f"{share:.3g}" for share in case["shares"]),
+                "/".join(f"{p:g}" for p in case["p"]),
                 f"`{case['method']}`" + (f" x {case['replicates']}" if case["replicates"] > 1 else ""),
                 f"{case['n_sim']:,.0f}" + (f", c.o.v. {case['target_cov']:g}" if case["target_cov"] else ""),
                 f"{case['coverage']:.3f}",
-                f"{case['below']} : {case['above']}",
-                f"{case['bias']:+.3f} ± {case['bias_error']:.3f}",
+                f"{case['below']}:{case['above']}",
+                f"{case['bias']:+.3f}±{case['bias_error']:.3f}",
                 f"{case['error']:.3f} ({case['own']:.3f})",
                 f"{case['whole']:.2f}",
             )

@@ -3,7 +3,7 @@
 import json
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,50 +47,6 @@ def even(shares=(0.7, 0.3), at=(1.5, 1.0)):
 def exact(shares, at, above=0.0):
     """P[f <= above]."""
     return sum(share * norm.sf(a - above) for share, a in zip(shares, at, strict=True))
-
-
-@dataclass(frozen=True)
-class SplitNormal:
-    """N(0, I) in two dimensions, but x1 lies below `limit` with another probability: two strata, "low" and "high"."""
-
-    limit: float
-    share: float
-    side: str = ""
-    dim: int = 2
-
-    @property
-    def strata(self):
-        shares = (("low", self.share), ("high", 1 - self.share))
-        return tuple(Side(name, share, SplitNormal(self.limit, float(name == "low"), name)) for name, share in shares)
-
-    def from_standard_normal(self, u):
-        q, own = norm.cdf(u[:, 0]), norm.cdf(self.limit)
-        low = q < self.share
-        below = q / self.share * own if self.share else q
-        above = (1 - q) / (1 - self.share) * (1 - own) if self.share < 1 else q
-        return np.column_stack([np.where(low, norm.ppf(np.where(low, below, 0.5)), norm.isf(above)), u[:, 1]])
-
-    def to_standard_normal(self, x):
-        own = norm.cdf(self.limit)
-        q = np.where(x[:, 0] < self.limit, norm.cdf(x[:, 0]) / own * self.share, 0.5)
-        up = norm.sf(x[:, 0]) / (1 - own) * (1 - self.share)
-        return np.column_stack([np.where(x[:, 0] < self.limit, norm.ppf(q), norm.isf(up)), x[:, 1]])
-
-    def sample(self, n, rng):
-        return self.from_standard_normal(rng.standard_normal((n, 2)))
-
-    def log_prob(self, x):
-        own, low = norm.cdf(self.limit), x[:, 0] < self.limit
-        with np.errstate(divide="ignore"):
-            factor = np.where(low, np.log(self.share) - np.log(own), np.log(1 - self.share) - np.log(1 - own))
-        return norm.logpdf(x).sum(axis=1) + factor
-
-
-@dataclass(frozen=True)
-class Side:
-    name: str
-    share: float
-    base: SplitNormal
 
 
 # ---- the sum
@@ -158,14 +114,13 @@ def test_simulations_go_where_the_error_of_the_sum_is():
 
 
 def test_one_stratum_is_the_plain_estimate():
-    base = SplitNormal(0.0, 0.5)
-    whole = [Side("all", 1.0, StandardNormal(2))]
+    whole = [SimpleNamespace(name="all", share=1.0, base=StandardNormal(2))]
     alone = type("Alone", (StandardNormal,), {"strata": whole})(2)
     for method in ("mc", "two-stage"):
         problems = FunctionProblem(half_space(2.5).f, base=alone), half_space(2.5)
         one, plain = (samplers.estimate(problem, method, seed=1, max_sim=2000) for problem in problems)
         assert one == plain and one.parts == ()
-    assert len(read_strata(base)) == 2 and read_strata(alone) == ()
+    assert read_strata(alone) == ()
 
 
 def test_strata_of_a_stratum_are_strata_of_the_sum():
@@ -181,15 +136,12 @@ def test_strata_of_a_stratum_are_strata_of_the_sum():
 
 
 def test_a_base_with_strata_serves_a_function():
-    """x1 < -3 in 1.35e-3 of all draws by itself, in a tenth of them here; failure: x2 > 3, or 1 where x1 is low."""
-    problem = FunctionProblem(lambda x: np.where(x[:, 0] < -3.0, 1.0, 3.0) - x[:, 1], base=SplitNormal(-3.0, 0.1))
-    check_base(problem.base, 2)
+    """Failure: x1 > 1 in the stratum of a tenth of x, x1 > 3 in the other."""
+    problem = FunctionProblem(lambda x: np.where(x[:, 0] < 1, 1.0, 3.0) - x[:, 1], base=even((0.1, 0.9)).base)
     result = samplers.estimate(problem, seed=0, max_sim=6000)
-    truth = 0.1 * norm.sf(1) + 0.9 * norm.sf(3)
-    assert result.interval[0] < truth < result.interval[1] and result.cov < 0.1
-    assert [part.name for part in result.parts] == ["low", "high"]
-    rare = result.reweight(SplitNormal(-3.0, 0.001))
-    assert rare.interval[0] < 0.001 * norm.sf(1) + 0.999 * norm.sf(3) < rare.interval[1]
+    assert result.interval[0] < exact((0.1, 0.9), (1, 3)) < result.interval[1] and result.cov < 0.1
+    rare = result.reweight(even((0.001, 0.999)).base)
+    assert rare.interval[0] < exact((0.001, 0.999), (1, 3)) < rare.interval[1]
 
 
 # ---- how a run goes
@@ -208,7 +160,7 @@ def test_the_same_seed_is_the_same_answer_with_any_workers():
 def test_an_interruption_anywhere_leaves_a_valid_estimate(method):
     problem = roads()
     whole = samplers.estimate(problem, method, seed=2, max_sim=4000)
-    for after in np.linspace(1, whole.n_sim - 1, 9).astype(int):
+    for after in np.linspace(1, whole.n_sim - 1, 5).astype(int):
         result = samplers.estimate(problem, method, seed=2, max_sim=4000, stop=lambda at, n=after: at.n_sim >= n)
         assert result.n_sim == sum(level.n_sim for level in result.trace)
         if result.n_sim < whole.n_sim:
@@ -221,14 +173,6 @@ def test_a_journal_continues_to_the_same_bits(tmp_path):
     assert cut.status is Status.STOPPED
     again = samplers.estimate(problem, **arguments)
     assert again == samplers.estimate(problem, seed=4, max_sim=3000)
-
-
-def test_asked_and_told_it_is_the_same():
-    problem = even()
-    run = samplers.TwoStage().start(problem, seed=0, max_sim=3000)
-    while not run.done:
-        run.tell(problem.evaluate(run.ask()))
-    assert run.result() == samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
 
 
 def test_a_stratum_without_a_failure_raises_the_upper_end_alone():
@@ -288,7 +232,7 @@ def test_a_target_that_cannot_be_met_is_told():
     assert result.n_sim == 300
 
 
-@pytest.mark.parametrize("max_sim", [1, 2, 3, 4, 11, 50, 61, 100])
+@pytest.mark.parametrize("max_sim", [1, 2, 4, 61, 100])
 @pytest.mark.parametrize("method", ["mc", "two-stage", "ce", "adss", "auto"])
 def test_tiny_budgets(method, max_sim):
     result = samplers.estimate(roads(), method, seed=0, max_sim=max_sim)
@@ -372,9 +316,9 @@ def test_the_lower_end_of_failures_with_an_outcome_keeps_its_level(whole):
     bad, good = (FunctionProblem(lambda x, k=k: f(x, lambda x: np.full(len(x), k)), 2) for k in (True, False))
     problem = FunctionProblem(f, 2) if whole else StratifiedProblem([Stratum("a", 0.5, bad), Stratum("b", 0.5, good)])
     lows = [
-        samplers.estimate(problem, "mc", seed=seed, max_sim=2000, on_error="bound").interval[0] for seed in range(100)
+        samplers.estimate(problem, "mc", seed=seed, max_sim=2000, on_error="bound").interval[0] for seed in range(60)
     ]
-    assert np.mean(np.array(lows) > 0.05) <= 0.07  # by chance above it in 1 of 100
+    assert np.sum(np.array(lows) > 0.05) <= 5  # by chance more in 1 of 200
 
 
 # ---- what follows from the points
@@ -558,7 +502,10 @@ def test_the_base_fits_together():
         (lambda: Stratum("a", 0.0, half_space(1.0)), "share of 'a'"),
         (lambda: Stratum("a", 0.5, lambda x: x), "problem with dim"),
         (lambda: Stratum("a", 0.5, half_space(1.0), log_sd=-1.0), "log_sd of 'a'"),
-        (lambda: read_strata(type("Base", (), {"strata": [Side("a", 1.0, None)]})), "base distribution of stratum 'a'"),
+        (
+            lambda: read_strata(SimpleNamespace(strata=[SimpleNamespace(name="a", share=1.0, base=None)])),
+            "base distribution of stratum 'a'",
+        ),
     ],
 )
 def test_errors_say_what_is_wrong(make, text):
