@@ -357,8 +357,8 @@ def format_changes(cells: Sequence[CalibrationCell], title: str) -> list[str]:
     lines.append("|---" * (len(STRATA) + 1) + "|")
     found: dict[str, dict[str, str]] = {}
     for cell in cells:
-        shares = [cell.probability(outcome).p for outcome in OUTCOMES]
-        text = "/".join(f"{p:.1e}" if p > 0 else "0" for p in shares)
+        shares = [cell.probability(outcome) for outcome in OUTCOMES]
+        text = "/".join(f"{p:.1e}" if p > 0 else f"<{high:.1e}" for p, _, high in shares)
         found.setdefault(cell.change, {})[cell.stratum] = text
     for change, texts in found.items():
         lines.append(f"| {change or 'as it is'} | {' | '.join(texts.get(name, '') for name in STRATA)} |")
@@ -380,7 +380,7 @@ def judge(found: Mapping[Event, EventCalibration]) -> list[str]:
             factor, within = each.factor(outcome), WITHIN[event]
             met = "met" if 1.0 / within <= factor <= within else "MISSED"
             told.append(
-                f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]}, within a factor of {within:g}: **{met}**, "
+                f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]}, within {within:g}: **{met}**, "
                 f"{describe_factor(factor)}."
             )
     return told
