@@ -53,6 +53,7 @@ FLOORS = {
     "car_following_ppo_compiled": 700.0,
     "env_step": 20.0,
     "vec_step": 1000.0,
+    "vec_step_cut_in": 1000.0,
     "vec_step_cut_in_v1": 500.0,
     "highway_1": 1.0,
     "highway_64": 30.0,
@@ -322,6 +323,7 @@ def main(
             results[f"car_following_ppo{ending}"] = policy_ratio(core, rounds)
         results["env_step"] = step_ratio(500)
         results["vec_step"] = batch_step_ratio(CAR_FOLLOWING, 200)
+        results["vec_step_cut_in"] = batch_step_ratio(CUT_IN, 200)
         results["vec_step_cut_in_v1"] = batch_step_ratio(CUT_IN_V1, 200)
         if with_memory:
             results["memory"] = memory()
