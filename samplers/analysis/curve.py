@@ -1,7 +1,7 @@
 """Curve: P[f(X) <= g] over thresholds g from one run, with a simultaneous band."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -135,6 +135,7 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     `confidence` (sup-t); it is found from 10,000 draws, whose generator comes from the seed.
     Where p rests on a search, the upper ends hold the share that it may have missed, as that of the estimate does, and
     what strata may add of which no point lies below the threshold.
+    Points without an outcome that only bound p ("bound") are not in the lower ends.
     The truth rises with g, so the ends of the band are made to rise too, which only narrows it.
 
     The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma
@@ -147,9 +148,15 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     sums, at_gamma = unit_sums(sample, grid), int(place[-1])
     use = np.unique(place[:-1])
     p = _anchor_at_estimate(estimate, sums.p, at_gamma)
-    cov = np.where(sums.is_count, 1.0, cov_inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
+    inflation = cov_inflation(estimate, float(sums.cov[at_gamma]))
+    cov = np.where(sums.is_count, 1.0, inflation) * sums.cov
     low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
-    low[use] = np.maximum.accumulate(low[use] * (1 - no_outcome_weight(estimate, sample) / sums.p[use]))
+    if lost := no_outcome_weight(estimate, sample):
+        known = unit_sums(replace(sample, f=np.where(np.isneginf(sample.f), np.inf, sample.f)), grid)
+        p_known = p * (1 - lost / np.maximum(sums.p, lost))
+        seen = use[p_known[use] > 0]
+        low, _ = simultaneous_intervals(known, seen, p_known, inflation * known.cov, estimate.confidence, estimate.seed)
+    low[use] = np.maximum.accumulate(low[use])
     high[use] = [
         add_unseen(*ends, sample.lineages, estimate.confidence) for ends in zip(p[use], high[use], strict=True)
     ]
