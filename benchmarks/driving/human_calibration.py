@@ -117,7 +117,7 @@ CHANGES: Mapping[str, Change] = {
     "never noticed": Change(("unseen",), {}, {"oblivious": 1.0}),
 }
 """Parts by name; "" is the model as it is. Of a change other than it, `CHANGED_SHARE` of the draws are driven."""
-CHANGED_SHARE = 0.1
+CHANGED_SHARE = 0.2
 EGOS: Mapping[str, float] = {HUMAN: 1.0, NO_HEADWAY_RULE: 1.0, "idm": 1.0, "imitation": 0.03}
 """Egos, and their share of the draws: networks are slow, and `vision`, a quarter of a second a drive, is too slow for
 counts like these. Those that get less than all of them are driven at the first site alone."""
