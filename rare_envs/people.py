@@ -196,12 +196,10 @@ class ModelCount(NamedTuple):
     def factor_from(self, low: float, high: float) -> float:
         """Return how many times it is above the upper end of an interval, or below the lower one (then under 1).
 
-        1 inside. Where nothing was counted the upper end of its own interval is compared, and must be below.
+        1 inside. Where nothing was counted the upper end of its own interval counts: it may be so many times above.
         """
         p = self.p if self.p > 0 else self.high
-        if p < low:
-            return p / low
-        return self.p / high if self.p > high else 1.0
+        return p / low if p < low else max(p / high, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,6 +231,14 @@ class EventCalibration:
     def factor(self, outcome: Outcome = "contacts", driver: str = "human") -> float:
         """Return the factor by which a driver misses people's interval per event; see `ModelCount.factor_from`."""
         return self.drivers[driver][outcome].factor_from(*self.people(outcome)[1])
+
+    def describe_factor(self, outcome: Outcome = "contacts", driver: str = "human") -> str:
+        """Return the factor in words, such as "7.5 times above people"; "may be" so where nothing was counted."""
+        factor, count = self.factor(outcome, driver), self.drivers[driver][outcome]
+        if factor == 1.0:
+            return "inside people's interval"
+        times = f"{factor:.2g} times above people" if factor > 1.0 else f"{1.0 / factor:.2g} times below people"
+        return times if count.p > 0 or factor < 1.0 else f"may be {times}"
 
     @property
     def is_calibrated(self) -> bool:

@@ -61,14 +61,15 @@ class Stratum(NamedTuple):
     event: Event
     words: str
     share: float
-    """Of the draws that are asked for, what it gets: where contacts are one in a hundred, fewer do."""
+    """Of the draws that are asked for, what it gets: where contacts are one in a hundred, fewer do; where people had
+    none in 3 million events, more must be without one. Changes of parts, and networks, get at most all."""
 
 
 STRATA: Mapping[str, Stratum] = {
     "looked": Stratum(CUT_IN, "cut_in", "cutters who looked", 1.0),
     "unseen": Stratum(CUT_IN, "cut_in", "cutters who had not looked", 0.1),
     "stop": Stratum(HARD_BRAKE, "stop", "leads that stop", 1.0),
-    "slowing": Stratum(HARD_BRAKE, "slowing", "leads that slow", 1.0),
+    "slowing": Stratum(HARD_BRAKE, "slowing", "leads that slow", 4.0),
 }
 EVENT_WORDS: Mapping[Event, str] = {"cut_in": "cut-in", "stop": "lead that stops", "slowing": "lead that slows"}
 OUTCOMES: tuple[Outcome, Outcome] = ("contacts", "near_crashes")
@@ -252,11 +253,14 @@ def plan(sites: Sequence[str], draws: int, egos: Sequence[str], changes: bool = 
             share = EGOS.get(ego, OWN_EGO_SHARE)
             if share < 1.0 and site != sites[0]:
                 continue
-            found |= {Drawn(site, name, ego): round(draws * share * each.share) for name, each in here.items()}
+            most = math.inf if share == 1.0 else 1.0
+            found |= {
+                Drawn(site, name, ego): round(draws * share * min(each.share, most)) for name, each in here.items()
+            }
         first = site == sites[0]
         for name, change in CHANGES.items() if changes and first else ():
             of = {Drawn(site, each, HUMAN, name): STRATA[each].share for each in change.strata if name and each in here}
-            found |= {what: round(draws * CHANGED_SHARE * max(share, 0.25)) for what, share in of.items()}
+            found |= {what: round(draws * CHANGED_SHARE * min(max(share, 0.25), 1.0)) for what, share in of.items()}
     return [(what, max(number, 100)) for what, number in found.items()]
 
 
@@ -365,13 +369,6 @@ def format_changes(cells: Sequence[CalibrationCell], title: str) -> list[str]:
     return [*lines, ""]
 
 
-def describe_factor(factor: float) -> str:
-    """Return a factor from people's interval in words."""
-    if factor == 1.0:
-        return "inside people's interval"
-    return f"{factor:.1f} times its upper end" if factor > 1.0 else f"{1.0 / factor:.1f} times below its lower end"
-
-
 def judge(found: Mapping[Event, EventCalibration]) -> list[str]:
     """Return a sentence on `human` for each target."""
     told = []
@@ -381,7 +378,7 @@ def judge(found: Mapping[Event, EventCalibration]) -> list[str]:
             met = "met" if 1.0 / within <= factor <= within else "MISSED"
             told.append(
                 f"{outcome.replace('_', '-')} per {EVENT_WORDS[event]}, within {within:g}: **{met}**, "
-                f"{describe_factor(factor)}."
+                f"{each.describe_factor(outcome)}."
             )
     return told
 

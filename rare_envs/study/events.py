@@ -60,11 +60,7 @@ class EventRate:
         """Why the rate is not calibrated: the human driver model misses people, or was not measured; empty if it is."""
         if self.calibration is None:
             return f"no calibration of {self.traffic}"
-        if self.calibration.is_calibrated:
-            return ""
-        factor = self.calibration.factor()
-        times = f"{factor:.2g} times above" if factor > 1.0 else f"{1.0 / factor:.2g} times below"
-        return f"uncalibrated, {times} people"
+        return "" if self.calibration.is_calibrated else f"uncalibrated, {self.calibration.describe_factor()}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

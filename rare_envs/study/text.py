@@ -93,9 +93,13 @@ def describe_people(counted: people.HumanBenchmark | None) -> str:
 
 def describe_model(each: EventRate) -> str:
     """Return what the human driver model and its bracket score per million km, and by what factor they miss people."""
-    known = each.calibration
-    scores = format_alike(*(known.per_million_km(name).p for name in (MODEL, BRACKET))) if known is not None else []
-    return ": ".join(filter(None, (" to ".join(dict.fromkeys(scores)), each.uncalibrated)))
+    known, scores = each.calibration, ""
+    if known is not None:
+        counts = [known.per_million_km(name) for name in (MODEL, BRACKET)]
+        scores = " to ".join(dict.fromkeys(format_alike(*(count.p for count in counts))))
+        if not any(count.p for count in counts):
+            scores = f"below {format_rate(max(count.high for count in counts))}"
+    return ": ".join(filter(None, (scores, each.uncalibrated)))
 
 
 def list_uncalibrated(events: Sequence[EventRate]) -> str:

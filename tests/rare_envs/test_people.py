@@ -63,7 +63,8 @@ def test_people_per_event_are_counts_over_events_in_as_many_km():
         (ModelCount(4e-5, 3e-5, 5e-5), 2.0),  # above the upper end
         (ModelCount(1.5e-5, 1e-6, 9e-5), 1.0),  # inside, whatever its own interval
         (ModelCount(2.5e-6, 1e-6, 9e-6), 0.25),  # below the lower end
-        (ModelCount(0.0, 0.0, 1e-4), 1.0),  # nothing counted, and too little simulated to tell
+        (ModelCount(0.0, 0.0, 1e-4), 5.0),  # nothing counted, and too little simulated to tell: up to 5 times
+        (ModelCount(0.0, 0.0, 1.9e-5), 1.0),  # nothing counted, all that it may be is inside or below
         (ModelCount(0.0, 0.0, 5e-6), 0.5),  # nothing counted, below people's lower end by 2 or more
     ],
 )
