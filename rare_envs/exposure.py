@@ -79,13 +79,13 @@ class CollisionRate:
         ValueError: p is 0 and has no interval.
 
     Example:
-        Brakings of the vehicle ahead happen 1.23 times per km; two in 100,000 end in a collision.
+        Brakings of the vehicle ahead happen 1.29 times per km; two in 100,000 end in a collision.
 
-        >>> counted = EventFrequency(count=268, hours=5.64, km=218.0, definition="brakings", source="US 101")
+        >>> counted = EventFrequency(count=283, hours=5.746, km=219.0, definition="brakings", source="US 101")
         >>> rate = CollisionRate(scenario="hard_brake", frequency=counted, p=1.8e-5, sampling_log_sd=0.02)
         >>> low, high = rate.interval_per_million_km
         >>> f"{rate.per_million_km:.0f} per million km, {low:.0f} to {high:.0f}"
-        '22 per million km, 20 to 25'
+        '23 per million km, 21 to 26'
     """
 
     scenario: str

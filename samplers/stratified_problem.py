@@ -79,7 +79,7 @@ class StratifiedProblem:
         ValueError: If there are none, two have the same name, or shares do not add up to 1.
 
     Example:
-        People look before they change lanes, but for 1.4 in 10,000:
+        Drivers who look before they change lanes, but for 1.4 in 10,000 of this example:
 
         >>> import samplers
         >>> looked = samplers.FunctionProblem(lambda x: 4.0 - x[:, 0], dim=2)  # Phi(-4) = 3.17e-5

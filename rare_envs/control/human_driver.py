@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.control.idm import COOLNESS, IDM, MAX_HEADING_COMMAND, improved_acceleration
+from rare_envs.control.idm import COOLNESS, IDM, MAX_HEADING_COMMAND, check_numbers, improved_acceleration
 from rare_envs.devices import constant
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import MAX_SLIP_SINE, NEAR_ZERO, STANDARD_GRAVITY, VEHICLE_LENGTH, State
@@ -139,6 +139,26 @@ ATTENTIVE_IDM: Final = IDM(
 """The IDM of motorways: Treiber and Kesting (2013), table 11.2, its values as commonly quoted."""
 
 
+_RANGES: Final = {
+    "from 0 to 1": ("coolness", "evasive_share"),
+    "from 0 to 180 degrees": ("glance_eccentricity",),
+    "of at least 0": ("brake_light", "glance_looming"),
+    "of at least 0, finite": (
+        "reaction_time",
+        "noticing_time",
+        "gap_error",
+        "approach_error",
+        "wandering",
+        "glance_ttc",
+        "evasive_distance",
+        "evasive_reach",
+        "evasive_clearance",
+    ),
+    "above 0": ("jerk",),
+    "above 0, finite": ("error_correlation", "evasive_acceleration"),
+}
+
+
 LONGEST_REACTION = 0.6
 """Longest reaction time [s] at which this model of braking was held against people."""
 
@@ -150,7 +170,10 @@ class HumanDriverModel:
     Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
 
     Raises:
-        ValueError: A parameter is negative or no number, or the eccentricity above 180 degrees.
+        ValueError: A parameter is out of its range: shares and weights are from 0 to 1, angles from 0 to 180 degrees,
+            all others finite and at least 0. `brake_light`, `glance_looming` and `jerk` may be infinite: no braking is
+            seen, whatever closes lets a glance begin, brakes build up at once. `jerk`, `error_correlation` and
+            `evasive_acceleration` are above 0.
 
     Warns:
         UserWarning: The reaction time is above 0.6 s.
@@ -219,12 +242,7 @@ class HumanDriverModel:
     """... and those with less than this between the sides, were the own one in the middle of its lane [m]: assumed."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, int | float) and not value >= 0:
-                raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
-        if self.glance_eccentricity > 180.0:
-            raise ValueError(f"Expected an eccentricity of 0 to 180 degrees, got {self.glance_eccentricity!r}.")
+        check_numbers(self, "human driver", _RANGES)
         if self.reaction_time > LONGEST_REACTION:
             warnings.warn(
                 f"reaction_time={self.reaction_time:g} s: above {LONGEST_REACTION} s this model of braking is wrong. "
@@ -307,7 +325,7 @@ def seen_expansion_rate(gap: Tensor, eccentricity: float) -> Tensor:
 
 def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) -> Tensor:
     """Return errors after dt [s]: exact Ornstein-Uhlenbeck processes of variance 1, from fresh normal draws."""
-    kept = math.exp(-dt / correlation) if correlation else 0.0
+    kept = math.exp(-dt / correlation)
     return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
 
 

@@ -10,10 +10,11 @@ References:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch
@@ -51,8 +52,36 @@ def yaw_rate_towards(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
     return (1.0 / TAU_HEADING) * (heading_command - heading)
 
 
-_POSITIVE = ("desired_speed", "max_acceleration", "comfortable_deceleration", "exponent", "max_deceleration")
-_NOT_NEGATIVE = ("time_headway", "jam_distance", "jam_distance_speed", "added_length")
+RANGES: Final[Mapping[str, Callable[[float], bool]]] = {
+    "from 0 to 1": lambda value: 0.0 <= value <= 1.0,
+    "from 0 to 180 degrees": lambda value: 0.0 <= value <= 180.0,
+    "of at least 0": lambda value: value >= 0.0,
+    "of at least 0, finite": lambda value: 0.0 <= value < math.inf,
+    "above 0": lambda value: value > 0.0,
+    "above 0, finite": lambda value: 0.0 < value < math.inf,
+}
+"""Ranges of the parameters of a model, in words."""
+
+
+def check_numbers(model: object, who: str, ranges: Mapping[str, Sequence[str]]) -> None:
+    """Raise a ValueError where a field of a model, by its range, is no number in it."""
+    for words, names in ranges.items():
+        for name in names:
+            value = getattr(model, name)
+            if not isinstance(value, Real) or not RANGES[words](float(value)):
+                raise ValueError(f"Expected {name} of the {who} to be a number {words}, got {value!r}.")
+
+
+_RANGES: Final = {
+    "above 0, finite": (
+        "desired_speed",
+        "max_acceleration",
+        "comfortable_deceleration",
+        "exponent",
+        "max_deceleration",
+    ),
+    "of at least 0, finite": ("time_headway", "jam_distance", "jam_distance_speed", "added_length"),
+}
 MIN_RATIO = 1e-24
 """Floor of speed / desired speed under the root: its slope stays finite at standstill, in single precision too."""
 
@@ -103,12 +132,7 @@ class IDM:
     """Whether its operations may be recorded: nothing about it changes."""
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE + _NOT_NEGATIVE:
-            value = getattr(self, name)  # a field by its name
-            known = isinstance(value, Real) and math.isfinite(value)
-            if not known or value < 0.0 or (name in _POSITIVE and value == 0.0):
-                least = "above 0" if name in _POSITIVE else "of at least 0"
-                raise ValueError(f"Expected {name} of the IDM to be a number {least}, got {value!r}.")
+        check_numbers(self, "IDM", _RANGES)
 
     @cached_property
     def closing_gain(self) -> float:

@@ -10,7 +10,6 @@ moves into whoever is beside it.
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -19,7 +18,7 @@ from scipy.special import ndtri
 from torch import Tensor
 
 from rare_envs.control.human_driver import ATTENTIVE_IDM
-from rare_envs.control.idm import COOLNESS, IDM, improved_acceleration
+from rare_envs.control.idm import COOLNESS, IDM, check_numbers, improved_acceleration
 from rare_envs.devices import scalars
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, base_files, columns
@@ -189,6 +188,20 @@ class CutInTheta(NamedTuple):
     """1 if it has turned back by now, else 0."""
 
 
+_RANGES: Final = {
+    "from 0 to 1": ("oblivious", "indicating"),
+    "of at least 0, finite": (
+        "reaction_time",
+        "most_braking",
+        "margin",
+        "noticing",
+        "noticing_spread",
+        "brakings_per_km",
+    ),
+    "above 0, finite": ("braking_window",),
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class CutterModel:
     """A cutter that drives as people do, and its lead: what `CutIn-v1` is made of.
@@ -210,7 +223,7 @@ class CutterModel:
         Olsen, "Modeling slow lead vehicle lane changing", 2003: indicators.
 
     Raises:
-        ValueError: A parameter is negative or no number, or a share above 1.
+        ValueError: A parameter is negative, infinite or no number, a share or weight above 1, or there is no window.
 
     Example:
         >>> CutterModel(looks=False).scenario().name  # a cutter that never looks
@@ -243,30 +256,26 @@ class CutterModel:
     indicating: float = 0.64
     """Share of changes with the indicator on from the start: Olsen (2003), 16 commuters."""
     brakings_per_km: float = 1.23
-    """Brakings of the lead by 3 m/s or more: US 101."""
+    """Brakings of the lead by 3 m/s or more: 268 on 218 km of US 101. The base of `HardBrake-v0` is read from the same
+    vehicles by rules that keep 283 on 219 km, 1.29 per km: 5 % more, within the error of such a count."""
     braking_window: float = 10.0
     """Its braking begins in the first so many seconds, at a uniform time [s]: an episode."""
     peak: tuple[float, float] = (0.730, 0.368)
-    """Mean and standard deviation of the logarithm of the peak of its deceleration [m/s^2]: 268 brakings of US 101."""
+    """Mean and standard deviation of the logarithm of the peak of its deceleration [m/s^2], of these 268 brakings; the
+    283 have 0.765 and 0.359."""
     loss: tuple[float, float] = (1.572, 0.318)
-    """The same of its loss of speed [m/s], which is at most its speed; the correlation of 0.32 is left out."""
+    """The same of its loss of speed [m/s], which is at most its speed; the 283 have 1.561 and 0.320. The correlation of
+    0.32 is left out."""
 
     def __post_init__(self) -> None:
-        shares = {"oblivious", "indicating", "coolness"}
-        for name in (
-            *shares,
-            "reaction_time",
-            "most_braking",
-            "margin",
-            "noticing",
-            "noticing_spread",
-            "brakings_per_km",
-        ):
-            value, most = getattr(self, name), 1.0 if name in shares else sys.float_info.max
-            if value is not None and not 0.0 <= value <= most:
-                raise ValueError(f"Expected {name} of the cutter from 0 to {most:.3g}, got {value!r}.")
-        if not 0.0 < self.braking_window < math.inf:
-            raise ValueError(f"Expected a braking_window above 0 s, got {self.braking_window!r}.")
+        check_numbers(self, "cutter", _RANGES)
+        if self.coolness is not None:
+            check_numbers(self, "cutter", {"from 0 to 1": ("coolness",)})
+        for name in ("peak", "loss"):
+            value = getattr(self, name)
+            if len(value) != 2 or not all(map(math.isfinite, value)) or value[1] < 0.0:
+                wanted = "a finite mean and a standard deviation of at least 0"
+                raise ValueError(f"Expected {name} of the cutter to be {wanted}, got {value!r}.")
 
     def scenario(self) -> Scenario:
         """Return the scenario with this cutter."""

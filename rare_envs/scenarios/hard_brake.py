@@ -1,9 +1,9 @@
 """Hard brake: a lead that brakes in front of an ego that followed it at its speed, to a standstill or not.
 
 The deceleration scenario of UN Regulation 157 (annex 4, appendix 3), where the lead brakes at a constant rate until it
-stands. Recorded brakings are parabolas instead: over 268 of NGSIM's US 101 the mean deceleration is 0.67 of the peak
-(0.72 over 121 of I-24) and the duration 1.48 loss / peak, where a parabola has 2/3 and 1.5. A constant rate leaves two
-thirds of the recorded way.
+stands. Recorded brakings are parabolas instead: over 286 of NGSIM's US 101 (the base has 283 of them) the mean
+deceleration is 0.68 of the peak and the duration 1.49 loss / peak, where a parabola has 2/3 and 1.5 (0.72 of the peak
+over 121 of I-24). A constant rate leaves two thirds of the recorded way.
 """
 
 import torch

@@ -26,8 +26,8 @@ from samplers.problem import read_strata
 if TYPE_CHECKING:
     from rare_envs.study.question import Study
 
-MODEL, BRACKET = "human", "human:no-headway-rule"
-"""The human driver model, and the one that brackets people together with it."""
+MODEL, NO_HEADWAY_RULE = "human", "human:no-headway-rule"
+"""The human driver model, and the same whose glances may be longer than the headway; people need not lie between."""
 COUNTED: tuple[str, ...] = get_args(Event)
 """Events of which people's contacts were counted."""
 

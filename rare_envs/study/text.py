@@ -15,7 +15,7 @@ from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
 from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
-from rare_envs.study.events import BRACKET, MODEL, EventRate
+from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.replay import name_parties
 from rare_envs.study.report import Report
@@ -92,11 +92,11 @@ def describe_people(counted: people.HumanBenchmark | None) -> str:
 
 
 def describe_model(each: EventRate) -> str:
-    """Return what the human driver model and its bracket score per million km, and by what factor they miss people."""
+    """Return the model's contacts per million km, with and without headway rule, and how far it is from people."""
     known, scores = each.calibration, ""
     if known is not None:
-        counts = [known.per_million_km(name) for name in (MODEL, BRACKET)]
-        scores = " to ".join(dict.fromkeys(format_alike(*(count.p for count in counts))))
+        counts = [known.per_million_km(name) for name in (MODEL, NO_HEADWAY_RULE)]
+        scores = " and ".join(dict.fromkeys(format_alike(*(count.p for count in counts))))
         if not any(count.p for count in counts):
             scores = f"below {format_rate(max(count.high for count in counts))}"
     return ": ".join(filter(None, (scores, each.uncalibrated)))
@@ -143,8 +143,8 @@ def tabulate_events(events: Sequence[EventRate]) -> list[str]:
 def describe_columns() -> str:
     """Return what the columns of people and of the human driver model are."""
     return (
-        f"{MODEL} to {BRACKET} in the same events; within a factor {people.CALIBRATED_WITHIN:g} of people's interval "
-        "a rate is calibrated (people: 100-Car, contacts at any speed)"
+        f"{MODEL} and {NO_HEADWAY_RULE} in the same events; within a factor {people.CALIBRATED_WITHIN:g} of people's "
+        "interval a rate is calibrated (people: 100-Car, contacts at any speed)"
     )
 
 

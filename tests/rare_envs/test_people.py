@@ -82,7 +82,7 @@ def test_calibrated_is_within_a_factor_of_3_of_either_end():
             assert found.is_calibrated == calibrated
 
 
-def test_the_shipped_calibration_has_both_drivers_of_the_bracket_at_each_site():
+def test_the_shipped_calibration_has_the_driver_with_and_without_headway_rule_at_each_site():
     for event, base in (("cut_in", "us101"), ("cut_in", "i80"), ("stop", "us101"), ("slowing", "us101")):
         found = calibration(event, base)
         assert (found.event, found.base) == (event, base)

@@ -64,19 +64,17 @@ class Asked:
     def refit(
         self,
         events: EventSet,
-        fit: Callable[[EventSet, np.random.Generator], T | None],
+        fit: Callable[[EventSet, np.random.Generator], T],
         family: Callable[[T], object] = type,
     ) -> list[T]:
-        """Return refits to events drawn anew, none if they are of under `MIN_CLUSTERS`; a fit of None is left out."""
+        """Return refits to events drawn anew, none if they are of under `MIN_CLUSTERS`."""
         if len(np.unique(events.clusters)) < MIN_CLUSTERS:
             return []
         rng, refits = np.random.default_rng(self.seed), list[T]()
         wanted = N_REFITS if self.n_refits is None else self.n_refits
         while len(refits) < wanted:
             self.report(f"refit {len(refits) + 1} of {wanted}")
-            one = fit(draw_events(events, rng), rng)
-            if one is not None:
-                refits.append(one)
+            refits.append(fit(draw_events(events, rng), rng))
             if self.n_refits is None and len(refits) == N_REFITS and len({family(each) for each in refits}) > 1:
                 wanted = MORE_REFITS
         return refits

@@ -11,7 +11,8 @@ deviation of 0.74: 44 events 0.15, traffic of the study thinner by up to 2.7 log
 of 2 log(2) / 2, and how soon drivers notice 0.4. A refit draws a share anew.
 
 **Brakings.** To a standstill: speed, gap and peak of the deceleration; all of the speed is lost. Others: the loss too,
-which leaves 1 m/s or more. A refit counts the shares of both in the clusters that it has drawn.
+which leaves 1 m/s or more. A refit counts the shares of both in the clusters that it has drawn, however few of one
+these hold; what is too few for a fit is drawn again from this stratum's own clusters, and has no part in the share.
 """
 
 from __future__ import annotations
@@ -341,6 +342,19 @@ def keep_strata(events: EventSet) -> EventSet:
     return replace(events, joint=events.joint[keep], clusters=events.clusters[keep], log=(*events.log, *log))
 
 
+def _share_of_last(parts: Sequence[_Brakings]) -> float:
+    """Return the share of the last part in the events of all; none is below half an event, as no share may be 0."""
+    count, total = len(parts[-1].events.joint), sum(len(each.events.joint) for each in parts)
+    return float(f"{min(max(count, 0.5), total - 0.5) / total:.6g}")
+
+
+def _draw_enough(part: _Brakings, own: EventSet, rng: np.random.Generator) -> _Brakings:
+    """Return a part with enough events for a fit: those it has, or clusters drawn from all of the part's own."""
+    while len(part.events.joint) < LEAST_BRAKINGS:
+        part = part._replace(events=draw_events(own, rng))
+    return part
+
+
 def fit_hard_brake(scenario: str, events: EventSet, asked: Asked) -> Fit:
     """Return brakings of `HardBrake-v0` with both strata, of events with speed, gap, peak and loss, (n, 4).
 
@@ -349,15 +363,13 @@ def fit_hard_brake(scenario: str, events: EventSet, asked: Asked) -> Fit:
     """
     parameters = tuple(scenario_named(scenario).parameters)
     split = _split_brakings(events, parameters)
-    kept = [each.name for each in split if len(each.events.joint)]
+    kept = [each for each in split if len(each.events.joint)]
+    names = [each.name for each in kept]
 
-    def fit(drawn: EventSet, starts: int | None) -> tuple[StratifiedDistribution, list[SystemFit]] | None:
-        parts = [each for each in _split_brakings(drawn, parameters) if each.name in kept]
-        if min(len(part.events.joint) for part in parts) < LEAST_BRAKINGS:
-            return None
-        total = sum(len(part.events.joint) for part in parts)
+    def fit(
+        parts: Sequence[_Brakings], stop: float, starts: int | None
+    ) -> tuple[StratifiedDistribution, list[SystemFit]]:
         best, strata = list[SystemFit](), list[Stratum]()
-        stop = float(f"{len(parts[-1].events.joint) / total:.6g}")
         for part, share in zip(parts, (1.0 - stop, stop) if len(parts) > 1 else (1.0,), strict=True):
             fits = [fit_system(part.events, each, part.box, asked.seed, starts) for each in part.systems]
             best.append(min(fits, key=lambda each: each.bic))
@@ -365,19 +377,20 @@ def fit_hard_brake(scenario: str, events: EventSet, asked: Asked) -> Fit:
             strata.append(Stratum(part.name, share, _with_loss(base, parameters) if part.name == "stop" else base))
         return StratifiedDistribution(tuple(strata), np.zeros(len(strata) - 1), column=3, less=0), best
 
-    def refit(drawn: EventSet, _: np.random.Generator) -> StratifiedDistribution | None:
-        found = fit(drawn, FOLD_STARTS)
-        return None if found is None else found[0]
+    def refit(drawn: EventSet, rng: np.random.Generator) -> StratifiedDistribution:
+        parts = [each for each in _split_brakings(drawn, parameters) if each.name in names]
+        enough = [_draw_enough(each, own.events, rng) for each, own in zip(parts, kept, strict=True)]
+        return fit(enough, _share_of_last(parts), FOLD_STARTS)[0]
 
     asked.report("fit")
-    fitted, best = cast(tuple[StratifiedDistribution, list[SystemFit]], fit(events, None))
+    fitted, best = fit(kept, _share_of_last(kept), None)
     checks: tuple[PredictiveCheck, ...] = ()
     for part in split:
         for name, _, base in fitted.strata:
             if name == part.name:
                 drawn = base.sample(CHECK_DRAWS, np.random.default_rng(asked.seed))[:, :3]
                 checks += check_states(BRAKING_STATES, f"{name}: {{}}", part.events.joint[:, :3], drawn)
-    pairs = list(zip(kept, best, strict=True))
+    pairs = list(zip(names, best, strict=True))
     return Fit(
         distribution=fitted,
         refits=tuple(asked.refit(events, refit)),

@@ -1,6 +1,7 @@
 """The human driver model and its glances."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,23 @@ def test_a_standing_lead_is_not_run_into() -> None:
 def test_longer_reaction_times_are_warned_of() -> None:
     with pytest.warns(UserWarning, match="this model of braking is wrong"):
         HumanDriverModel(reaction_time=0.8)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, 1.1) for name in ("coolness", "evasive_share")),
+        *((name, 0.0) for name in ("error_correlation", "jerk", "evasive_acceleration")),
+        *((name, math.inf) for name in ("reaction_time", "noticing_time", "error_correlation", "glance_ttc")),
+        *((name, -0.1) for name in ("gap_error", "approach_error", "wandering", "brake_light", "glance_looming")),
+        ("glance_eccentricity", 181.0),
+        ("evasive_distance", math.nan),
+        ("evasive_reach", "1 m"),
+    ],
+)
+def test_a_driver_that_cannot_be_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"^Expected {name} of the human driver to be a number .*, got {value!r}\\.$"):
+        HumanDriverModel(**{name: value})
 
 
 @pytest.mark.parametrize("gap", [5.0, 20.0, 40.0, 200.0])

@@ -264,8 +264,6 @@ def test_worlds_and_stacks_that_it_does_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="Expected an ego without noise of its own behind a stack"):
         problem("CutIn", agents.load_ego("noisy:human"))
     world = problem("CutIn").world
-    with pytest.raises(ValueError, match="an eccentricity of 0 to 180 degrees"):
-        HumanDriverModel(glance_eccentricity=400.0)
     with pytest.raises(ValueError, match="call with_draws first"):
         HumanEgo().in_world(world).act(world.start(torch.zeros(1, 6)), None)
 

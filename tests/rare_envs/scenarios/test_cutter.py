@@ -1,5 +1,6 @@
 """The cutter of `CutIn-v1`, by pencil and paper: when it turns back, when it goes on, and what it never does."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -252,11 +253,17 @@ def test_the_cutter_speeds_up_behind_a_faster_lead_as_human_drivers_do() -> None
         ("coolness", np.nan),
         ("reaction_time", np.inf),
         ("braking_window", 0.0),
+        ("peak", (np.nan, 0.4)),
+        ("peak", (0.7,)),
+        ("loss", (1.6, -0.3)),
+        ("loss", (np.inf, 0.3)),
     ],
 )
-def test_a_cutter_that_cannot_be_is_refused(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        CutterModel(**{name: value})  # type: ignore[arg-type]
+def test_a_cutter_that_cannot_be_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(
+        ValueError, match=f"^Expected {name} of the cutter to be a .*, got {re.escape(repr(value))}\\.$"
+    ):
+        CutterModel(**{name: value})
 
 
 def test_drivers_take_the_pedals_and_not_the_looks() -> None:

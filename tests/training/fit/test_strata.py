@@ -39,16 +39,30 @@ def test_the_share_who_do_not_look_is_that_of_44_events() -> None:
     assert np.exp(1.96 * UNSEEN_LOG_SD) == pytest.approx(4.3, abs=0.1)
 
 
-@pytest.mark.parametrize(("stops", "left"), [(7, ["slowing"]), (53, ["stop"]), (30, ["slowing", "stop"])])
-def test_a_stratum_of_too_few_brakings_is_left_out_of_all(quick, stops: int, left: list[str]) -> None:
-    """Of 60 brakings, some to a standstill: refits have the strata of the fit, and the events are those of these."""
+def brakings(stops: int) -> EventSet:
+    """60 brakings, each a cluster of its own; the first so many to a standstill."""
     rng = np.random.default_rng(0)
     speed, loss = rng.uniform(12.0, 20.0, 60), rng.uniform(4.0, 9.0, 60)
     loss[:stops] = speed[:stops]
     rows = np.column_stack([speed, rng.lognormal(2.5, 0.4, 60), rng.lognormal(0.7, 0.3, 60), loss])
-    base = fit_base("hard_brake", EventSet(rows, np.arange(60)), {}, "a test", n_refits=8)
+    return EventSet(rows, np.arange(60))
+
+
+@pytest.mark.parametrize(("stops", "left"), [(7, ["slowing"]), (53, ["stop"]), (30, ["slowing", "stop"])])
+def test_a_stratum_of_too_few_brakings_is_left_out_of_all(quick, stops: int, left: list[str]) -> None:
+    """Of 60 brakings, some to a standstill: refits have the strata of the fit, and the events are those of these."""
+    base = fit_base("hard_brake", brakings(stops), {}, "a test", n_refits=8)
     assert [[each.name for each in one.strata] for one in (base, *base.refits)] == [left] * 9
     assert base.events.used == ({7: 53, 53: 53, 30: 60}[stops],)
+
+
+def test_the_share_of_a_stratum_of_few_is_right_in_the_mean_of_the_refits(quick) -> None:
+    """10 of 60: refits that left out draws of fewer than 10 would have .200 in the mean, none below 1 / 6."""
+    base = fit_base("hard_brake", brakings(10), {}, "a test", n_refits=40)
+    shares = np.array([one.strata[1].share for one in base.refits])
+    deviation = np.sqrt(1 / 6 * 5 / 6 / 60)
+    assert shares.mean() == pytest.approx(1 / 6, abs=3.0 * deviation / 40**0.5)
+    assert shares.std() == pytest.approx(deviation, rel=0.25)
 
 
 def test_too_few_of_both_strata_are_none() -> None:
