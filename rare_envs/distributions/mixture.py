@@ -112,8 +112,8 @@ class MappedMixture:
     def _to_normal(self, x: FloatArray) -> FloatArray:
         u = np.empty(x.shape)
         for j, column in self._conditionals(x):
-            y = move_inside(self.coordinates.coordinate(j, x), column.low, column.high)
-            u[:, j] = column.to_normal(y) if self.coordinates.rises(j) else -column.to_normal(y)
+            v = column.to_normal(self.coordinates.coordinate(j, x))
+            u[:, j] = v if self.coordinates.rises(j) else -v
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:

@@ -1,8 +1,9 @@
 """One-dimensional normal mixtures cut to an interval: masses, maps to and from the standard normal, draws.
 
 Arrays hold components in rows and points in columns, (K, n). A column does not depend, bit for bit, on the others of a
-call. Masses are logarithms read from the smaller tail, so that they stay accurate far from the bulk; quantiles are
-found by Newton's method on the scale of the standard normal, where the map is nearly straight.
+call. Masses are logarithms read from the smaller tail, so that they stay accurate far from the bulk. Quantiles of a
+single normal are those of its distribution function in plain numbers, where these do; all others are found by Newton's
+method on the scale of the standard normal, where the map is nearly straight.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtri_exp
+from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
-from rare_envs.distributions.coordinates import FloatArray
+from rare_envs.distributions.coordinates import FloatArray, move_inside
 
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 NARROW = 1e-3
@@ -25,6 +26,11 @@ NARROW = 1e-3
 small as the cancellation in a difference of distribution functions, 1e-12."""
 NEAR_END = 0.1
 """Quantiles less than this over (1 + |a|) from an end of the interval are first looked for along a constant density."""
+PLAIN = 1e-5
+"""Least probability from an end to a quantile, over that beyond the end, of which rounding of their sum, 1e-16, leaves
+1e-10 on the scale of the standard normal, and..."""
+LEAST = 1e-250
+"""...least such probability in plain numbers."""
 LAST_ERROR = 1e-7
 """On the scale of the standard normal: a step of Newton's method from there, which leaves its square, is the last."""
 MOST_STEPS = 200
@@ -56,14 +62,37 @@ class TruncatedConditional:
         return log_sum(self._log_parts)
 
     def to_normal(self, x: FloatArray) -> FloatArray:
-        """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
-        x = np.clip(x, self.low, self.high)  # rounding may have led beyond an end
+        """Return Phi^-1 of the distribution function at x (n,), by the smaller tail; at an end one float inside."""
+        x = move_inside(x, self.low, self.high)
         below, above = (self._log_tail(x, np.full(len(x), side)) for side in (True, False))
         tail = np.minimum(below, above) - np.logaddexp(below, above)
         return cast(FloatArray, np.where(below <= above, 1.0, -1.0) * ndtri_exp(tail))
 
     def from_normal(self, u: FloatArray) -> FloatArray:
         """Invert `to_normal`, (n,) -> (n,)."""
+        if len(self.mean) > 1 or self.is_log is not None:
+            return self._solve(u)
+        found, fits = self._invert_alone(u)
+        rest = np.flatnonzero(~fits)
+        if rest.size:
+            found[rest] = self.take(rest)._solve(u[rest])
+        return np.asarray(np.clip(found, self.low, self.high))
+
+    def _invert_alone(self, u: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the quantiles of a single normal at Phi(u), (n,), in plain numbers, and where these do.
+
+        Rows with u > 0 are mirrored, and read from the upper tail where the interval then begins above the mean.
+        """
+        mirrored, (start, end, _) = u > 0.0, (each[0] for each in self._ends)
+        a, b = np.where(mirrored, -end, start), np.where(mirrored, -start, end)
+        turned = np.where(a > 0.0, -1.0, 1.0)
+        beyond = ndtr(turned * a)
+        part = ndtr(-np.abs(u)) * (ndtr(turned * b) - beyond)
+        z = np.where(mirrored, -turned, turned) * ndtri(beyond + part)
+        return self.mean[0] + z * self.scale[0], np.abs(part) > np.maximum(PLAIN * beyond, LEAST)
+
+    def _solve(self, u: FloatArray) -> FloatArray:
+        """Return the quantiles at Phi(u), (n,), by Newton's method in logarithms."""
         with np.errstate(all="ignore"):  # the ends of the interval, and components without weight, give inf and nan
             total = np.broadcast_to(self.log_whole_mass(), u.shape)
             return solve_rising(

@@ -148,6 +148,8 @@ def test_quantiles_near_an_end_that_cuts_the_bulk_off_are_exact(scale: float) ->
     assert ((x >= 0.0) & (x <= 1.0) & (np.diff(x, prepend=-1.0) > 0.0)).all()
     np.testing.assert_allclose(cut.to_normal(x)[u < 0], u[u < 0], atol=1e-12)
     np.testing.assert_allclose(cut.to_normal(x), u, atol=1e-7)  # near 1 the next number is further off
+    ends = cut.to_normal(cut.from_normal(np.array([-60.0, -38.0, 38.0, 60.0])))
+    assert np.isfinite(ends).all() and (np.sign(ends) == [-1.0, -1.0, 1.0, 1.0]).all()
 
 
 def test_a_beta_variable_has_quantiles_however_far_out() -> None:
