@@ -130,6 +130,10 @@ def test_what_drivers_accept_is_supported_by_the_recorded_starts():
         assert np.std(np.log(record["limits_of_refits"])) > 0.05
 
 
+UPPER_QUARTILE = 1
+"""Which of those of `describe_starts`."""
+
+
 def describe_starts(starts):
     """Share that closes, upper quartile and ninth decile of 1 / TTC, and share of TTC under 5 s; (..., n, 4)."""
     inverse = (starts[..., 0] - starts[..., 1]) / starts[..., 3]
@@ -139,7 +143,10 @@ def describe_starts(starts):
 @needs_data("us101_cut_in_events.csv", "i80_coifman.parquet")
 @pytest.mark.parametrize(("site", "other"), [("us101", "i80"), ("i80", "us101")])
 def test_starts_at_a_site_that_was_not_used_are_as_the_refits_expect(site, other):
-    """As many draws of each of 30 refits as there are starts, 20 times: positions from .05 to .998 measured."""
+    """As many draws of each of 30 refits as there are starts, 20 times: within 95 % of these, but for one of eight.
+
+    I-80 is denser: its upper quartile of 1 / TTC is above all but 0.3 % of what US 101 expects.
+    """
     recorded = next(each for each in SHIPPED_BASES if each.answers and each.name == other).read(DATA)[0].joint
     rng, found = np.random.default_rng(0), []
     for each in load_base(scenario_named("rare_envs/CutIn-v1"), site).refits:
@@ -147,8 +154,8 @@ def test_starts_at_a_site_that_was_not_used_are_as_the_refits_expect(site, other
         found.append(describe_starts(drawn.reshape(20, len(recorded), -1)))
     found, wanted = np.concatenate(found, axis=1), np.array(describe_starts(recorded))[:, None]
     position = (found < wanted).mean(axis=1) + 0.5 * (found == wanted).mean(axis=1)
-    assert ((position > 0.001) & (position < 0.999)).all()
-    assert np.median(np.abs(position - 0.5)) < 0.475
+    beyond = (position < 0.025) | (position > 0.975)
+    assert np.flatnonzero(beyond).tolist() == ([UPPER_QUARTILE] if other == "i80" else [])
 
 
 def test_new_leaders_are_jumps_of_the_gap_that_stay():
