@@ -21,6 +21,7 @@ from rare_envs.people import Event, EventCalibration, HumanBenchmark, calibratio
 from rare_envs.scenarios.registry import env_id_of, find_scenario
 from samplers import analysis
 from samplers.analysis.base_error import BaseUncertainty
+from samplers.analysis.reweight import find_fitted_base, refit_quantile
 from samplers.problem import read_strata
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ class EventRate:
     parts: Mapping[str, float]
     """Shares of the rate by stratum; empty where there is one stratum, or nothing failed."""
     unresolved: Mapping[str, float] = field(default_factory=dict)
-    """Upper ends of the rate [per million km] in strata that are not resolved, see `samplers.method.Part`."""
+    """Upper ends of the rate [per million km] in strata that are not resolved, see `samplers.method.Part`; that of an
+    event which is such a stratum under its own name."""
     traffic: str
     """The base distribution, and the options that make other traffic of it."""
     calibration: EventCalibration | None
@@ -100,6 +102,20 @@ def find_calibration(event: str, study: Study) -> EventCalibration | None:
     env_id = study.question.env_id
     newest = env_id_of(find_scenario(env_id).name) == env_id.rpartition(":")[2]
     return calibration(event, describe_traffic(study)) if newest else None  # type: ignore[arg-type]
+
+
+def bound_shares(estimate: samplers.Estimate) -> list[float]:
+    """Return the upper end of the share of each of `estimate.parts`: no more of the events can end in a collision.
+
+    It is that of a log-normal share with the spread of the refits; the share itself where the base has none.
+    """
+    shares, fitted = [part.share for part in estimate.parts], find_fitted_base(estimate.base)
+    if fitted is None or len(fitted.refits) < 2 or fitted.clusters < 2:
+        return shares
+    of_refits = np.array([[stratum.share for stratum in read_strata(refit)] for refit in fitted.refits])
+    quantile = refit_quantile(estimate.confidence, len(of_refits) - 1, fitted.clusters)
+    largest = shares * np.exp(quantile * np.log(of_refits).std(axis=0, ddof=1))
+    return [float(each) for each in np.minimum(largest, 1.0)]
 
 
 def list_part_errors(estimate: samplers.Estimate) -> list[BaseUncertainty | None]:

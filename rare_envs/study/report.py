@@ -20,7 +20,14 @@ from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
-from rare_envs.study.events import COUNTED, EventRate, describe_traffic, find_calibration, list_part_errors
+from rare_envs.study.events import (
+    COUNTED,
+    EventRate,
+    bound_shares,
+    describe_traffic,
+    find_calibration,
+    list_part_errors,
+)
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
@@ -335,16 +342,16 @@ class Report:
         apart = bool(parts) and all(part.name in COUNTED for part in parts)
         found = self._rate_parts(whole) if apart else [(whole.scenario, 1.0, whole)]
         shares = {} if apart or not self.estimate.p else {part.name: part.of_sum for part in parts}
-        scale = MILLION_KM * whole.frequency.per_km
-        vague = () if apart else (part for part in parts if not part.resolved)
-        unresolved = {part.name: scale * part.share * part.interval[1] for part in vague}
+        scale, vague = MILLION_KM * whole.frequency.per_km, [part for part in parts if not part.resolved]
+        bounds = {} if apart else {part.name: scale * part.share * part.interval[1] for part in vague}
+        doubtful = [part.name for part in vague if apart and part.p > 0]
         return tuple(
             EventRate(
                 event=name,
                 share=share,
                 rate=rate,
                 parts=shares,
-                unresolved=unresolved,
+                unresolved={name: rate.interval_per_million_km[1]} if name in doubtful else bounds,
                 traffic=describe_traffic(self.study),
                 calibration=find_calibration(name, self.study),
             )
@@ -352,12 +359,16 @@ class Report:
         )
 
     def _rate_parts(self, whole: CollisionRate) -> list[tuple[str, float, CollisionRate]]:
-        """Return name, share and rate of each stratum; none is above the upper end of the whole."""
+        """Return name, share and rate of each stratum, at most that of the whole, and one collision in each event.
+
+        Of a stratum that is not resolved the upper end alone is known, and refits of what was found say nothing.
+        """
         assert whole.interval is not None  # `_rate_of` gives it
-        found = []
-        for part, error in zip(self.estimate.parts, list_part_errors(self.estimate), strict=True):
-            ends = part.share * part.interval[0], part.share * part.interval[1]
-            rate = self._rate_of(part.share * part.p, part.cov, ends, error, whole.interval[1])
+        found, estimate = [], self.estimate
+        for part, error, most in zip(estimate.parts, list_part_errors(estimate), bound_shares(estimate), strict=True):
+            low, of_base = (part.interval[0], error) if part.resolved else (0.0, None)
+            ends = part.share * low, part.share * part.interval[1]
+            rate = self._rate_of(part.share * part.p, part.cov, ends, of_base, min(most, whole.interval[1]))
             assert rate is not None  # as there is one of the whole
             found.append((part.name, part.share, rate))
         return found

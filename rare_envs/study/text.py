@@ -128,15 +128,18 @@ def tabulate_events(events: Sequence[EventRate]) -> list[str]:
     """Return a table of the rates of events per million km, each beside people and the human driver model in it."""
     rows = [("", "per km", "per event", "per million km", "people in them", "human model")]
     for each in events:
-        rate = each.rate
-        found = rate.p if rate.p > 0 or rate.interval is None else rate.interval[1]
-        p = f"{'below ' if rate.p == 0 else ''}{found / each.share:.1e}"
+        rate, resolved = each.rate, each.event not in each.unresolved
+        found = rate.p if rate.interval is None or (rate.p > 0 and resolved) else rate.interval[1]
+        p = f"{'' if rate.p > 0 and resolved else 'below '}{min(found / each.share, 1.0):.1e}"
         numbers = format_rate(rate.frequency.per_km * each.share), p
-        ego = format_with_interval(rate.per_million_km, rate.interval_per_million_km)
+        ends = rate.interval_per_million_km
+        ego = format_with_interval(rate.per_million_km, ends) if resolved else f"below {format_rate(ends[1])}"
         name = EVENT_NOUNS.get(each.event, each.event)
         rows.append((name, *numbers, ego, describe_people(each.people), describe_model(each)))
     head, *lines = tabulate(rows)
-    parts = ([f"  {more}"] if (more := describe_parts(each.parts, each.unresolved)) else [] for each in events)
+    vague = ({name: end for name, end in each.unresolved.items() if name != each.event} for each in events)
+    below = (describe_parts(each.parts, ends) for each, ends in zip(events, vague, strict=True))
+    parts = ([f"  {more}"] if more else [] for more in below)
     return [head, *(line for row, more in zip(lines, parts, strict=True) for line in (row, *more))]
 
 

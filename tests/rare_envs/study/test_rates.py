@@ -251,6 +251,34 @@ def test_a_part_without_a_failure_has_an_upper_end(tmp_path: Path) -> None:
         assert each.rate.interval_per_million_km[1] > each.share * 1e6 * 42 / 218 * 3 / 400  # the rule of three
 
 
+def test_no_event_has_more_collisions_than_there_are_events(tmp_path: Path) -> None:
+    """Refits so far apart that they leave p open up to 1: at most every event of a kind is a collision.
+
+    How many there are has the error of 42 counts and of the share, log-normal over 30 refits.
+    """
+    report = run(prepare(question(write_stratified(tmp_path / "brakings.json", spread=3.0), max_sim=400)))
+    assert report.estimate.base_uncertainty.bound == 1.0
+    refits = [[stratum.share for stratum in refit.strata] for refit in report.study.fitted.refits]
+    factors = np.exp(stats.t.ppf(0.975, 29) * np.log(refits).std(axis=0, ddof=1))
+    for each, factor in zip(report.events, factors, strict=True):
+        events = 1e6 * 42 / 218 * min(each.share * factor, 1.0) * math.exp(1.96 / 42**0.5)
+        assert each.rate.per_million_km < each.rate.interval_per_million_km[1] <= 1.0001 * events
+
+
+def test_an_event_that_is_not_resolved_has_the_upper_end_of_its_stratum(tmp_path: Path) -> None:
+    report = run(prepare(question(write_stratified(tmp_path / "brakings.json"), max_sim=400)))
+    slowing, stop = report.estimate.parts
+    vague = replace(stop, resolved=False, outcome=replace(stop.outcome, interval=(1e-9, 0.45)))
+    report = replace(report, estimate=replace(report.estimate, parts=(slowing, vague)))
+    known, unknown = report.events
+    assert known.rate.determined and not known.unresolved
+    high = 1e6 * 42 / 218 * 0.2 * 0.45 * math.exp(stats.norm.ppf(0.975) / math.sqrt(42))
+    assert not unknown.rate.determined and unknown.unresolved == pytest.approx({"stop": high})
+    _, first, second = tabulate_events(report.events)
+    assert f"{slowing.p:.1e}" in first and "below 4.5e-01" in second and f"below {format_rate(high)}" in second
+    assert f"{stop.p:.1e}" not in second
+
+
 def event_of(base: str | None, env_id: str = "rare_envs/CutIn-v1", **changes):
     asked = Question(env_id=env_id, base=base, method="mc", max_sim=100, **changes)
     report = run(prepare(asked))
