@@ -211,7 +211,7 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
     record = read("egos")
     yield f"## Egos\n\n`{record['command']}`: p of a collision within 10 s by the default method, `auto`, or by plain"
     yield "draws, `mc`; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the base has strata, p"
-    yield "in each of them too, or the upper end of an interval that is wider than a factor of 1,000.\n"
+    yield "in each of them too, or its upper end where it is not resolved.\n"
     cells = [cell for cell in record["cells"] if cell["env_id"] in ids]
     yield format_table(
         ("scenario", "ego", "by", "p", "95 % interval", "strata", "warnings", "likeliest crash"),
@@ -223,8 +223,8 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
                 f"{cell['p']:.1e}" if cell["p"] else "0",
                 f"{cell['low']:.1e} to {cell['high']:.1e}" if cell["low"] else f"below {cell['high']:.1e}",
                 ", ".join(
-                    f"{name} {f'{p:.1e}' if high < 1000 * low else f'below {high:.1e}'}"
-                    for name, (p, low, high) in cell["parts"].items()
+                    f"{name} {f'{p:.1e}' if resolved else f'below {high:.1e}'}"
+                    for name, (p, _, high, resolved) in cell["parts"].items()
                 ),
                 str(len(cell["warnings"])),
                 cell["words"],

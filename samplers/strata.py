@@ -7,7 +7,7 @@ whose part of the rest is no larger than its pilot keeps the pilot; any other ha
 that of the new run alone, so that the pilot decides how large the run is and adds nothing to it. Only where the new run
 meets no failure and the pilot did, both count, by their simulations: so p is a little too high where failures are few.
 Counts of plain draws are pooled with those of the pilot, which makes p too low by about a tenth of its standard error
-(`benchmarks/samplers/strata.py`).
+(`benchmarks/samplers/strata.py`); plain draws after a search that resolved nothing are worth it however few they are.
 
 With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in strata whose own c.o.v. is above
 t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum without a failure goes on, as far as
@@ -193,6 +193,10 @@ class _Sum:
         in_vain = stratum in self.searched and (hits > 0 or self._is_unresolved(stratum))
         return PlainDraws() if self.chooses and (hits >= OFTEN or in_vain) else None
 
+    def _has_draws_next(self, stratum: int) -> bool:
+        """Return whether plain draws come next in a stratum that is not resolved: all count in its upper end."""
+        return self._is_unresolved(stratum) and self._find_method(stratum) is not None
+
     def _is_unresolved(self, stratum: int) -> bool:
         """Return whether simulations of a stratum have met no failure, or too few to say how likely they are."""
         part = self.parts[stratum]
@@ -210,8 +214,9 @@ class _Sum:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
         widths = [part.share * (part.interval[1] - part.interval[0]) for part in parts]
         need = np.sqrt(np.maximum(self.behind, 1.0)) * widths
-        pools = [part.outcome.counts is not None for part in parts]
-        least = np.where(pools, 0.0, self.behind)  # a new run takes the place of the one before: a smaller one is worse
+        # a new run takes the place of the one before, and a smaller one is worse; draws are added to those before
+        adds = [p.outcome.counts is not None or self._has_draws_next(i) for i, p in enumerate(parts)]
+        least = np.where(adds, 0.0, self.behind)
         sizes = np.zeros(len(parts))
         while use.any():
             sizes = np.floor((self.goal.budget - self.n_sim) * need * use / (need * use).sum())
@@ -269,9 +274,10 @@ class _Sum:
         old = part.outcome
         if n_old == 0:
             return found, n
-        if pool_counts([old, found]) is not None:
-            return replace(combine([old, found], self.goal.confidence), trace=()), n_old + n
         drawn = old.base_draws + found.base_draws
+        if pool_counts([old, found]) is not None:
+            pooled = replace(combine([old, found], self.goal.confidence), trace=())
+            return self._bound(pooled, drawn) if pooled.p == 0 else pooled, n_old + n
         if found.status is Status.STOPPED:
             return replace(old, base_draws=drawn), n_old
         if found.interval[1] < old.interval[0]:
@@ -283,9 +289,13 @@ class _Sum:
             high = max(clopper_pearson(0, drawn, self.goal.confidence)[1], old.p)
             return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
         if found.p == 0 == old.p:
-            about = f"None of {drawn:,} base draws failed: p = 0 with a one-sided interval."
-            interval = clopper_pearson(0, drawn, self.goal.confidence)
-            return replace(found, interval=interval, base_draws=drawn, warnings=(about,)), n
+            return self._bound(found, drawn), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost
             return dilute(old, found, n_old / (n_old + n)), n_old + n
         return replace(found, base_draws=drawn), n
+
+    def _bound(self, nothing: Outcome, drawn: int) -> Outcome:
+        """Return an outcome without a failure, with the upper end of all base draws, those of a search included."""
+        interval = clopper_pearson(0, drawn, self.goal.confidence)
+        about = f"None of {drawn:,} base draws failed: p = 0 with a one-sided interval."
+        return replace(nothing, interval=interval, base_draws=drawn, warnings=(about,))

@@ -58,8 +58,9 @@ class EgoResult:
     """The likeliest failure."""
     steps: int = 0
     """Environment steps of the ego's training; 0 for an ego that is not trained here."""
-    parts: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """By stratum of the base distribution: p in it, and the ends of its interval; empty where there are no strata."""
+    parts: dict[str, tuple[float, float, float, bool]] = field(default_factory=dict)
+    """By stratum of the base distribution: p in it, the ends of its interval, and whether it is resolved; empty where
+    there are no strata."""
 
 
 def version_of(env_id: str) -> str:
@@ -105,7 +106,7 @@ def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, at_
         warnings=estimate.warnings,
         words=describe_likeliest(report),
         steps=steps if trained else 0,
-        parts={part.name: (part.p, *part.interval) for part in estimate.parts},
+        parts={part.name: (part.p, *part.interval, part.resolved) for part in estimate.parts},
     )
 
 
