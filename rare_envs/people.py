@@ -233,12 +233,12 @@ class EventCalibration:
         return self.drivers[driver][outcome].factor_from(*self.people(outcome)[1])
 
     def describe_factor(self, outcome: Outcome = "contacts", driver: str = "human") -> str:
-        """Return the factor in words, such as "7.5 times above people"; "may be" so where nothing was counted."""
+        """Return the factor in words, such as "7.5 times above people's interval"; "may be" so where nothing was counted."""
         factor, count = self.factor(outcome, driver), self.drivers[driver][outcome]
         if factor == 1.0:
             return "inside people's interval"
-        times = f"{factor:.2g} times above people" if factor > 1.0 else f"{1.0 / factor:.2g} times below people"
-        return times if count.p > 0 or factor < 1.0 else f"may be {times}"
+        way = f"{factor:.2g} times above" if factor > 1.0 else f"{1.0 / factor:.2g} times below"
+        return f"{'' if count.p > 0 or factor < 1.0 else 'may be '}{way} people's interval"
 
     @property
     def is_calibrated(self) -> bool:

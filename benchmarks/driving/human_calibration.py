@@ -333,7 +333,7 @@ def show(p: ModelCount, scale: float = 1.0, digits: str = ".1e") -> str:
 def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[str]:
     """Return the tables of egos and people, per event and per million km.
 
-    Egos are left out who had nothing, and whose draws are too few to tell them from people.
+    Egos are left out who had nothing, and whose draws are too few to tell them from people; a line names them.
     """
     lines = [f"### {site}", ""]
     for event, each in found.items():
@@ -346,23 +346,25 @@ def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[st
         ]
         ends = {outcome: each.people(outcome) for outcome in OUTCOMES}
         people: dict[str, ModelCount] = {outcome: ModelCount(p, *interval) for outcome, (p, interval) in ends.items()}
+        vague = []
         for ego, of in {**each.drivers, "**people**": people}.items():
             if any(of[outcome].p > 0 or of[outcome].high < people["near_crashes"].low for outcome in OUTCOMES):
                 values = [show(of[outcome]) for outcome in OUTCOMES]
                 values += [show(of[outcome], scale, ".2g") for outcome in OUTCOMES]
                 lines.append(f"| {ego} | {' | '.join(values)} |")
-        lines.append("")
+            else:
+                vague.append(f"{ego} had none in too few draws to say more than {show(of['contacts'])}")
+        lines += ["", *(f"{'; '.join(vague)}.\n" for _ in vague[:1])]
     return lines
 
 
 def format_changes(cells: Sequence[CalibrationCell], title: str) -> list[str]:
-    """Return the table of contacts / near-crashes by part taken away and stratum."""
+    """Return the table of contacts / near-crashes, with their intervals, by part taken away and stratum."""
     lines = [title, "", f"| contacts / near-crashes | {' | '.join(each.words for each in STRATA.values())} |"]
     lines.append("|---" * (len(STRATA) + 1) + "|")
     found: dict[str, dict[str, str]] = {}
     for cell in cells:
-        shares = [cell.probability(outcome) for outcome in OUTCOMES]
-        text = "/".join(f"{p:.1e}" if p > 0 else f"<{high:.1e}" for p, _, high in shares)
+        text = " / ".join(show(cell.probability(outcome)).replace(" ", "") for outcome in OUTCOMES)
         found.setdefault(cell.change, {})[cell.stratum] = text
     for change, texts in found.items():
         lines.append(f"| {change or 'as it is'} | {' | '.join(texts.get(name, '') for name in STRATA)} |")
@@ -412,7 +414,8 @@ def format_measured(cells: Sequence[CalibrationCell], sites: Sequence[str], comm
     lines = [
         f"{MEASURED}\n",
         f"`{command}`; intervals of 95 % are of sampling, and of people's counts, alone: the share of cutters who had "
-        "not looked and the frequencies of events count as exact.\n",
+        "not looked and the frequencies of events count as exact. `vision`, too slow to count, is among the "
+        "[results](results.md).\n",
         *format_events(calibrate(cells, sites[0]), sites[0]),
         "### Targets\n",
     ]

@@ -292,7 +292,7 @@ def test_the_calibration_is_that_of_the_base_and_a_miss_by_more_than_three_has_i
     assert (at_home.calibration.base, elsewhere.calibration.base) == ("us101", "i80")
     assert at_home.uncalibrated == "" == list_uncalibrated([at_home])
     factor = elsewhere.calibration.drivers["human"]["contacts"].p * elsewhere.calibration.per_km * 3.2187e6 / 5.572
-    assert factor > 3.0 and elsewhere.uncalibrated == f"uncalibrated, {factor:.2g} times above people"
+    assert factor > 3.0 and elsewhere.uncalibrated == f"uncalibrated, {factor:.2g} times above people's interval"
     assert describe_model(elsewhere).endswith(f": {elsewhere.uncalibrated}")
     assert list_uncalibrated([at_home, elsewhere]) == "cut-ins"
 
