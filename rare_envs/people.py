@@ -233,7 +233,7 @@ class EventCalibration:
         return self.drivers[driver][outcome].factor_from(*self.people(outcome)[1])
 
     def describe_factor(self, outcome: Outcome = "contacts", driver: str = "human") -> str:
-        """Return the factor in words, such as "7.5 times above people's interval"; "may be" so where nothing was counted."""
+        """Return the factor, as "7.5 times above people's interval", or that it may be so where nothing was counted."""
         factor, count = self.factor(outcome, driver), self.drivers[driver][outcome]
         if factor == 1.0:
             return "inside people's interval"
