@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -91,8 +91,8 @@ class StratifiedProblem:
         5.43e-05, of which unseen 41%
     """
 
-    def __init__(self, strata: Sequence[Stratum]) -> None:
-        self.strata = tuple(strata) if isinstance(strata, Sequence) else ()
+    def __init__(self, strata: Iterable[Stratum]) -> None:
+        self.strata = tuple(strata) if isinstance(strata, Iterable) else ()
         if not self.strata or not all(isinstance(each, Stratum) for each in self.strata):
             raise ValueError(f"Expected at least one samplers.Stratum(name, share, problem), got {strata!r}.")
         self.base = StratifiedBase(self.strata, tuple(float(each.share) for each in self.strata))

@@ -491,6 +491,12 @@ def test_the_base_fits_together():
     assert problem.column_names == ("stratum", "x1", "x2", "x3") and problem.chunk_size == 16
 
 
+def test_strata_may_come_from_any_iterable():
+    parts = {name: Stratum(name, 0.5, half_space(1.0)) for name in "ab"}
+    for given in (parts.values(), (each for each in parts.values()), np.array([*parts.values()])):
+        assert [each.name for each in StratifiedProblem(given).strata] == ["a", "b"]
+
+
 @pytest.mark.parametrize(
     ("make", "text"),
     [
