@@ -360,11 +360,11 @@ def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[st
 
 def format_changes(cells: Sequence[CalibrationCell], title: str) -> list[str]:
     """Return the table of contacts / near-crashes, with their intervals, by part taken away and stratum."""
-    lines = [title, "", f"| contacts / near-crashes | {' | '.join(each.words for each in STRATA.values())} |"]
+    lines = [title, "", f"| contacts, near-crashes | {' | '.join(each.words for each in STRATA.values())} |"]
     lines.append("|---" * (len(STRATA) + 1) + "|")
     found: dict[str, dict[str, str]] = {}
     for cell in cells:
-        text = " / ".join(show(cell.probability(outcome)).replace(" ", "") for outcome in OUTCOMES)
+        text = "<br>".join(show(cell.probability(outcome)).replace(" ", "") for outcome in OUTCOMES)
         found.setdefault(cell.change, {})[cell.stratum] = text
     for change, texts in found.items():
         lines.append(f"| {change or 'as it is'} | {' | '.join(texts.get(name, '') for name in STRATA)} |")
