@@ -402,8 +402,8 @@ def judge_cutters(cells: Sequence[CalibrationCell], site: str) -> list[str]:
     return [
         f"Contacts among the conflicts with cutters who had not looked: {low:.1%} to {high:.1%}; people none of 44 "
         "own and none of 58 sideswipe conflicts, under 3.6 %.",
-        f"P(near-crash | not looked) is {near:.3f}, with which a share of {share:.2e} gives people's 44 near-crashes "
-        f"in own changes (the base has {shares['unseen']:.2e}): what it adds to near-crashes is calibrated.",
+        f"P(near-crash | not looked) is {near:.3f}, which gives a share of {share:.2e} (the base has "
+        f"{shares['unseen']:.2e}).",
         f"By type, in the 100-Car's distance: {own:.0f} near-crashes at cut-ins that the ego avoids (people: 74 "
         f"rear-end), {theirs:.0f} that the cutter avoids (people: 58 sideswipe).",
     ]
