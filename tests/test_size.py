@@ -11,13 +11,13 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 55_500,
-    "code lines": 35_100,
+    "package lines": 55_650,
+    "code lines": 35_210,
     "modules": 220,
-    "functions": 3_130,
+    "functions": 3_140,
     "classes": 475,
     "import lines, percent of code": 10.7,
-    "test lines": 31_500,
+    "test lines": 31_560,
     "pages": 18,
     "words of pages": 40_000,
     "files entered by an estimate": 42,

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.devices import indices, may_hold
-from rare_envs.traffic.bodies import Which, crossing, encounter, overlaps, pairs
+from rare_envs.devices import indices
+from rare_envs.traffic.bodies import Which, boxes_overlap, crossing, encounter, pairs
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -96,7 +96,7 @@ def crash_of(state: State, road: Road, before: State | None = None, dt: float = 
     """
     crash = _pair_crash(state, road, before, dt, "ego")
     off = (crash.kind == NONE) & road.off_road(state.y[:, 0])
-    return crash.replace_where(off, _edge_crash(state, before, dt)) if may_hold(off) else crash
+    return crash.replace_where(off, _edge_crash(state, before, dt))
 
 
 def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
@@ -108,17 +108,17 @@ def crash_of_others(state: State, road: Road, before: State | None = None, dt: f
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: Which) -> Crash:
     """Return the first contact among some pairs of vehicles."""
     n, nothing = state.x.shape[1], Crash.nothing(state.x[:, 0])
-    touching = overlaps(state, road, which)
-    if not may_hold(touching):
-        return nothing
     of_pairs = slice(0, n - 1) if which == "ego" else slice(n - 1, None)
     numbers = [indices(index[of_pairs], state.x) for index in pairs(n)]
+    if not len(numbers[0]):
+        return nothing
     met = encounter(state, road, which, before, dt)
     axes, rate = met.axes, met.rate
     enter, _ = crossing(axes, rate)
     since, axis = enter.max(-1)
     resting = torch.isinf(since)  # nothing moves: the axis along which they overlap least
     axis = torch.where(resting, axes.gap.argmax(-1), axis)
+    touching = boxes_overlap(*met[:4])
     at = torch.where(touching, torch.where(resting, torch.finfo(since.dtype).min, since), torch.inf)
     pair = at.argmin(1, keepdim=True)
 
@@ -132,25 +132,25 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
     closing = (-on_axis(rate) * towards).clamp(min=0.0)
     couple = torch.stack([of(each.expand_as(at)) for each in numbers], -1)
     kind = _kind(of(axis), of(met.other_heading - met.heading), of(axes.offset[..., 0]))
-    vehicles = torch.where(_is_pursued(state, before, dt, kind == SIDE, couple), couple.flip(-1), couple)
+    own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
+    vehicles = torch.where((own >= its)[:, None], couple, couple.flip(-1))
     change = ((1.0 + RESTITUTION) / 2.0 * closing)[:, None].expand(-1, 2)
-    lengthwise = torch.stack((injury_risk(change[:, 0], "frontal"), injury_risk(change[:, 1], "rear")), -1)
-    risk = torch.where((kind == SIDE)[:, None], injury_risk(change), lengthwise)
+    lengthwise = (kind != SIDE)[:, None]
+    risk = torch.stack((injury_risk(change[:, 0], "frontal"), injury_risk(change[:, 1], "rear")), -1)
+    risk = torch.where(lengthwise, risk, injury_risk(change))
     speed = of((met.dvx.square() + met.dvy.square()).sqrt())
     crash = Crash(kind, vehicles, speed, closing, change, risk)
     return nothing.replace_where(touching.any(1), crash)
 
 
-def _is_pursued(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
-    """Return whether the second of two (B, 2) moves faster towards the first, across the road or along it, (B, 1)."""
-    if before is None:
-        along, across = state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading)
-    else:
+def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
+    """Return the speed of the first of two towards the second, across the road or along it [m/s], shape (B,)."""
+    along, across = state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading)
+    if before is not None:
         along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
-    places, speeds = (
-        torch.where(side[:, None], b, a).gather(1, couple) for a, b in ((state.x, state.y), (along, across))
-    )
-    return speeds.sum(1, keepdim=True) * places.diff(dim=1) < 0.0
+    place, speed = torch.where(side[:, None], state.y, state.x), torch.where(side[:, None], across, along)
+    first, second = place.gather(1, couple).unbind(1)
+    return speed.gather(1, couple[:, :1])[:, 0] * torch.sign(second - first)
 
 
 def _kind(axis: Tensor, turn: Tensor, ahead: Tensor) -> Tensor:
