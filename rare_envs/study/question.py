@@ -213,7 +213,7 @@ def _answers_vary(problem: DrivingProblem, on_error: str) -> bool:
         words = ("" if isinstance(error, SystemExit) else str(error)) or repr(error)
         if on_error != "raise":
             words = f"{words.rstrip('.')}. --on-error {on_error} counts scenarios of a run; this check comes before it"
-        raise BadInput(f"The ego fails on its first observation: {words}") from error
+        raise BadInput(f"The ego fails on its first observation of {problem.env_id}: {words}") from error
     same = torch.equal(first.state.speed, again.state.speed) and torch.equal(first.state.heading, again.state.heading)
     return not same
 
