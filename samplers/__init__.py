@@ -22,6 +22,7 @@ from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.series.method import Series
 from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
@@ -84,6 +85,7 @@ __all__ = [
     "RunArguments",
     "Sample",
     "Sensitivity",
+    "Series",
     "Share",
     "StandardNormal",
     "Status",

@@ -37,6 +37,7 @@ METHODS = {
     "ss": "SubsetSimulation",
     "adss": "AdaptiveSubsetSimulation",
     "two-stage": "TwoStage",
+    "series": "Series",
     "surrogate": "Surrogate",
 }
 COMMANDS = {

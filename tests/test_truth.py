@@ -58,7 +58,7 @@ def test_a_few_seeds(method: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", list(samplers.METHODS))
+@pytest.mark.parametrize("method", [name for name in samplers.METHODS if name != "series"])  # made for many dimensions
 @pytest.mark.parametrize("row", TRUTH, ids=lambda row: f"{row['env_id']}-{row['base']}")
 def test_forty_seeds(row: dict[str, float], method: str) -> None:
     cell = compare_with_truth(row, method, range(1000, 1040))

@@ -17,9 +17,10 @@ from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.series.method import Series
 from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate import Surrogate
-from samplers.methods.two_stage.method import TwoStage, suits_terms
+from samplers.methods.two_stage.method import TwoStage
 from samplers.output import register_stored
 from samplers.problem import Inputs, check_name, check_settings
 
@@ -29,6 +30,10 @@ FEW = (300, 500)
 (`benchmarks/results/against_truth.json`), where those of `TwoStage` hold it in 24 of 24 with 600 and with 1,000."""
 MOST_DIMS = 6
 """Dimensions up to which `Surrogate` was measured (`benchmarks/results/few_simulations.json`)."""
+LONG = 30
+"""Dimensions from which `Series` takes over; with fewer the exploration of `TwoStage` misses as little."""
+ENOUGH = 1000
+"""Simulations from which `Series` has room for walks, rounds and an estimate."""
 SLOW = 1.0
 """Seconds of a simulation from which on 6,000 of them are taken as too many where max_sim does not say: 100 minutes."""
 SLOW_BUDGET = 1000
@@ -37,12 +42,12 @@ SLOW_BUDGET = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class Auto(Method):
-    """Choice between the two methods for all problems, by a rule that looks at no outcome; the default of `estimate`.
+    """Choice between three methods, by a rule that looks at no outcome; the default of `estimate`.
 
-    1. *Budget and dimension.* `Surrogate` where a run has 300 to 500 simulations and the search at most 6 dimensions
+    1. *Terms.* `Series` where the problem offers terms and their gradients, with 30 coordinates or more and 1,000
+       simulations or more.
+    2. *Budget and dimension.* `Surrogate` where a run has 300 to 500 simulations and the search at most 6 dimensions
        (coordinates that the base distribution calls noise are not searched), `TwoStage` otherwise.
-    2. *Terms.* `TwoStage` searches by terms with 30 coordinates or more, 1,000 simulations or more, and a problem that
-       offers terms and their gradients.
     3. *Cost.* Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, 1,000;
        a target c.o.v. without max_sim goes to `TwoStage`.
 
@@ -79,11 +84,12 @@ class Auto(Method):
         slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
         usual = SLOW_BUDGET if slow else TwoStage().n
         budget = usual if goal.max_sim is None else goal.max_sim
-        by_terms = suits_terms(inputs, offer_of(inputs), budget)
+        offer = offer_of(inputs)
+        by_terms = offer is not None and offer.gradient_cost is not None and inputs.dim >= LONG and budget >= ENOUGH
         few = FEW[0] <= budget <= FEW[1] and dim <= MOST_DIMS
-        method = Surrogate() if few else TwoStage()
-        how = method.name + " by terms" * by_terms
-        return Choice(method, f"{how}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}", unusual=few)
+        method = Series() if by_terms else Surrogate() if few else TwoStage()
+        why = f"{method.name}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}" + " and terms" * by_terms
+        return Choice(method, why, unusual=by_terms or few)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Take the steps of the method chosen."""
@@ -137,7 +143,7 @@ class Methods(Mapping[str, type[Stepping]]):
 
 
 METHODS = Methods(
-    *(Auto, TwoStage, Surrogate, MonteCarlo, ImportanceSampling, CrossEntropy, ImprovedCrossEntropy),
+    *(Auto, TwoStage, Series, Surrogate, MonteCarlo, ImportanceSampling, CrossEntropy, ImprovedCrossEntropy),
     *(SubsetSimulation, AdaptiveSubsetSimulation),
 )
 register_stored(*(METHODS[name] for name in METHODS.own))

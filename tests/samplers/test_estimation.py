@@ -27,7 +27,10 @@ PROBLEM = half_space().problem
         ({"replicates": None}, "replicates to be a whole number of at least 1, got None"),
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
         ({"on_error": "fail"}, "Unknown on_error 'fail'. Did you mean 'failure'.*Valid: raise, failure, bound"),
-        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: auto, two-stage, surrogate, mc, .*adss"),
+        (
+            {"method": "adds"},
+            "method 'adds'. Did you mean 'adss'.*Valid: auto, two-stage, series, surrogate, .*adss",
+        ),
         ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
         ({"method": 3}, "a method such as MonteCarlo"),
         ({"progress": 1}, "progress to be True, False or a function"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.mcmc import RootedPoints
-from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, offer_of
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share, offer_of
 from samplers.methods.base import (
     ComponentDraws,
     Method,
@@ -29,7 +29,7 @@ from samplers.methods.two_stage.refinement import (
     typical_weights,
 )
 from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval
-from samplers.methods.two_stage.settings import EXPLORATION, FALLBACK, REFINEMENT, ROUNDS, TWO_STAGE
+from samplers.methods.two_stage.settings import EXPLORATION, FALLBACK, REFINEMENT, TWO_STAGE
 from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
     StratifiedSample,
@@ -39,7 +39,6 @@ from samplers.methods.two_stage.stratified import (
     check_regions,
     check_rounds,
 )
-from samplers.methods.two_stage.term_search import search_terms
 from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import DrawWeights, Interval, Sample, Status, binomial_cov, effective_sample_size
@@ -91,9 +90,8 @@ class TwoStage(Method):
     contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
     exceed 0.3. A region that neither f announces nor any draw has hit gives no warning; `Estimate.unseen` bounds it.
 
-    *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,
-    are searched by another algorithm (`term_search.py`). Where terms are offered otherwise, a term of which no state
-    of the chains fails is searched alone (`terms_alone.py`); a remark names those that did not reach failure.
+    *Terms.* Where they are offered, a term of which no state of the chains fails is searched alone (`terms_alone.py`);
+    a remark names those that did not reach failure.
 
     *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
     Carlo), and where no mixture describes the failures (adaptive subset simulation in all coordinates): dozens of
@@ -135,17 +133,9 @@ class TwoStage(Method):
         return run_two_stage(inputs, goal, self.n if goal.max_sim is None else goal.max_sim, rng)
 
 
-def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int) -> bool:
-    """Return whether to search by terms: terms and gradients are offered, x is long and the budget holds a search."""
-    offered = offer is not None and offer.gradient_cost is not None
-    return offered and inputs.dim >= ROUNDS.min_dim and budget >= ROUNDS.min_budget
-
-
 def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
     """Estimate P[f(X) <= goal.gamma] with a budget that need not be the goal's."""
     offer = offer_of(inputs)
-    if offer is not None and suits_terms(inputs, offer, budget):
-        return (yield from search_terms(inputs, offer, goal, budget, rng))
     record = TermRecord() if offer is not None and offer.with_f else None
     outcome = yield from _explore_and_estimate(inputs, goal, budget, rng, record)
     return outcome if record is None else replace(outcome, remarks=(*outcome.remarks, *record.describe(outcome.p)))

@@ -18,11 +18,10 @@ from scipy.special import ndtr
 from samplers.components import IsotropicNormal
 from samplers.method import request_terms
 from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
+from samplers.methods.series.walks import answer_by_terms, join_terms
 from samplers.methods.two_stage.exploration import bisect_towards_origin, choose_roots, walk_lines
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.settings import EXPLORATION, TERMS_ALONE
-from samplers.methods.two_stage.term_search import answer_by_terms
-from samplers.methods.two_stage.term_walks import join_terms
 from samplers.problem import FloatArray, FunctionProblem, Terms
 
 _T = TypeVar("_T")

@@ -30,8 +30,8 @@ def test_rule(expected, arguments):
     assert choice(**arguments) == expected
 
 
-def test_noise_does_not_count_as_dimensions_and_a_search_by_terms_is_named():
-    """Two coordinates are searched and 100 are noise: with terms and 1,000 simulations that is a search by terms."""
+def test_noise_does_not_count_as_dimensions_and_terms_are_searched():
+    """Two coordinates are searched and 100 are noise: with terms and 1,000 simulations `series` takes them."""
 
     class Base(samplers.StandardNormal):
         noise = np.arange(102) >= 2
@@ -39,7 +39,7 @@ def test_noise_does_not_count_as_dimensions_and_a_search_by_terms_is_named():
     for offer, max_sim, name, why in (
         (None, 300, "surrogate", "surrogate: 300 simulations for 2 dimensions"),
         (None, 1000, "two-stage", "two-stage: 1,000"),
-        (TermsOffer(gradient_cost=5.0), 1000, "two-stage", "two-stage by terms: 1,000"),
+        (TermsOffer(gradient_cost=5.0), 1000, "series", "series: 1,000"),
     ):
         choice = samplers.Auto().choose(InputsOnly(102, Base(102), offer), Goal(gamma=0.0, max_sim=max_sim))
         assert choice.method.name == name and choice.why.startswith(why)

@@ -17,7 +17,7 @@ MAX_SIM = {"two-stage": 3000, "surrogate": 150}
 SLOW_CHECKS = (check_accuracy, check_budget, check_dimensions, check_interruption)
 
 
-ALL = sorted(set(METHODS) - {"auto"})  # "auto" is another of them; those of other packages too
+ALL = sorted(set(METHODS) - {"auto", "series"})  # "auto" is another of them, "series" is for problems with terms
 SLOW = pytest.mark.slow
 WHOLE = [pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALL]
 """Kriging takes seconds of its own: one estimate of it stands among the quick tests."""
@@ -46,6 +46,7 @@ BAD_SETTINGS = {
     samplers.SubsetSimulation: [{"distribution": "beta"}, {"spread": 0.0}],
     samplers.AdaptiveSubsetSimulation: [{"n": 5}, {"p0": 0.5}, {"scale": 0.0}, {"sigma0": "sample"}],
     samplers.TwoStage: [{"n": 399}, {"n": True}],
+    samplers.Series: [{"n": 399}],
     samplers.Surrogate: [{"n": 59}],
     samplers.Auto: [{"seconds_per_simulation": -1.0}],
 }

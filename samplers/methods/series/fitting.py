@@ -18,14 +18,14 @@ from scipy.special import logsumexp, ndtr
 
 from samplers.components import SubspaceGaussian, draw_counts, log_ratios, mixture_log_ratio, posterior
 from samplers.methods.base import SimulationSteps
+from samplers.methods.series.settings import LAW, ROUNDS, WALKS
+from samplers.methods.series.walks import Directions, TermSimulator, Walks, describe_half_spaces, join_terms
 from samplers.methods.two_stage.mixture import (
     LEAST_VARIANCE_OF_COMPONENT,
     GroupedPoints,
     SubspaceMixture,
     fit_subspace_mixture,
 )
-from samplers.methods.two_stage.settings import LAW, ROUNDS, WALKS
-from samplers.methods.two_stage.term_walks import Directions, TermSimulator, Walks, describe_half_spaces, join_terms
 from samplers.problem import FloatArray, Terms
 from samplers.proposals import correct_eigenvalues
 from samplers.sample import (

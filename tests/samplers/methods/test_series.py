@@ -1,4 +1,4 @@
-"""The search by terms on series systems with exact p, and what it does where terms or gradients are wrong."""
+"""Series on series systems with exact p, and what it does where terms or gradients are wrong."""
 
 import numpy as np
 import pytest
@@ -163,8 +163,10 @@ def test_a_run_that_is_stopped_anywhere_has_an_outcome():
 
 
 def test_simulations_made_by_the_user_are_searched_as_before():
-    """`start` offers no terms; the run asks for points only and ends with an estimate."""
+    """`start` offers no terms: `series` says so, another method asks for points only and ends with an estimate."""
     problem, _, _ = half_spaces(40, 1e-2)
+    with pytest.raises(ValueError, match=r"Series needs a problem with `terms` and `gradient`"):
+        samplers.Series().start(problem)
     run = samplers.TwoStage().start(problem, seed=1, max_sim=1500)
     while not run.done:
         run.tell(problem.evaluate(run.ask()))

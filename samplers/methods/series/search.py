@@ -4,9 +4,9 @@ f is a least over terms (which car is hit, ahead or behind, early or late), and 
 half-space. In standard normal space:
 
 1. *Walks* (`walks.py`): from low base draws of every term that matters downhill along its gradient to its failures.
-2. *Rounds* (`rounds.py`, `fitting.py`): for each term Gaussians in the subspace of its gradients, N(0, I)
+2. *Rounds* (`fitting.py`): for each term Gaussians in the subspace of its gradients, N(0, I)
    across it; fitted anew after every round to all draws so far, weighted by the balance heuristic.
-3. *Estimate* (`rounds.py`): three final rounds, each from a proposal fitted to what came before, with exact weights
+3. *Estimate*: three final rounds, each from a proposal fitted to what came before, with exact weights
    and shares in p that were fixed beforehand: p = sum_r c_r mean(w_r 1{f <= gamma}) counts failures of any term.
 
 Each p_r is unbiased given the past: subspaces, terms and Gaussians may be wrong and p stays right; only its c.o.v.
@@ -14,35 +14,27 @@ suffers. Where the rounds show that they are wrong, adaptive subset simulation t
 """
 
 import math
-from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share, request_terms
+from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share
 from samplers.methods.base import RunContext, SimulationSteps
 from samplers.methods.monte_carlo import MonteCarlo
-from samplers.methods.subset import spend_on_subset_simulation
-from samplers.methods.two_stage.settings import (
-    DIAGNOSTICS,
-    DOUBTS,
-    FALLBACK,
-    ROUNDS,
-    TWO_STAGE,
-    WALKS,
-)
-from samplers.methods.two_stage.term_fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
-from samplers.methods.two_stage.term_walks import (
+from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
+from samplers.methods.series.settings import DOUBTS, ROUNDS, WALKS
+from samplers.methods.series.walks import (
     TermSimulator,
+    answer_by_terms,
     choose_starts,
     choose_terms,
     count_walks,
     walk_downhill,
 )
+from samplers.methods.subset import spend_on_subset_simulation
 from samplers.problem import FloatArray, Inputs, Terms
 from samplers.sample import (
     DrawWeights,
@@ -53,9 +45,6 @@ from samplers.sample import (
     effective_sample_size,
     largest_weight_share,
 )
-
-_T = TypeVar("_T")
-
 
 MOST_LEVELS = 6
 """Levels of a tenth to plan for at most, and where nothing is known: with fewer than needed the last are short."""
@@ -171,8 +160,8 @@ def doubt(combined: CombinedRounds, pursued: list[int]) -> list[str]:
             f"Effective sample size of the last round's failing draws: {ess:.0f}; its standard error is unreliable."
         )
     failing = last[last > 0]
-    if len(failing) and largest_weight_share(np.log(failing)) > DIAGNOSTICS.max_point_share:
-        warnings.append(f"One draw carries more than {100 * DIAGNOSTICS.max_point_share:.0f} % of the last round.")
+    if len(failing) and largest_weight_share(np.log(failing)) > DOUBTS.max_point_share:
+        warnings.append(f"One draw carries more than {100 * DOUBTS.max_point_share:.0f} % of the last round.")
     other = combined.share_of_others(pursued)
     if other > DOUBTS.max_other_share:
         warnings.append(f"{100 * other:.0f} % of p comes from terms without a proposal of their own.")
@@ -188,30 +177,6 @@ def ordering_values(terms: Terms, gamma: float) -> FloatArray:
     above = float(np.nextafter(gamma, np.inf))
     values = np.where(terms.f <= gamma, np.minimum(shifted, gamma), np.maximum(shifted, above))
     return np.where(np.isneginf(terms.f), -np.inf, values)
-
-
-def answer_by_terms(
-    steps: Generator[FloatArray, FloatArray, _T], read: Callable[[FloatArray, Terms], FloatArray]
-) -> Generator[FloatArray, FloatArray, _T]:
-    """Run steps that ask for f (n,) at points (n, d), with terms requested in its place, from which `read` gives f."""
-    answer: FloatArray | None = None
-    while True:
-        try:
-            x = next(steps) if answer is None else steps.send(answer)
-        except StopIteration as end:
-            return cast(_T, end.value)
-        if len(x) == 0:
-            answer = np.empty(0)
-            continue
-        try:
-            terms = yield from request_terms(x)
-        except BaseException as error:
-            try:
-                steps.throw(error)
-            except StopIteration as end:
-                return cast(_T, end.value)
-            raise
-        answer = read(x, terms)
 
 
 def order_by_terms(steps: Steps, gamma: float) -> Steps:
@@ -261,11 +226,16 @@ class SearchState:
 def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
     """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + TWO_STAGE.max_batches * ROUNDS.target_batch if open_ended else budget
+    end = budget + ROUNDS.max_target_batches * ROUNDS.target_batch if open_ended else budget
     search = TermSearch(inputs, TermSimulator(inputs, offer, goal), goal, budget, end, rng)
+    if budget < ROUNDS.min_budget:
+        outcome = yield from MonteCarlo(n=budget, batch=budget).steps(inputs, replace(goal, max_sim=end), rng)
+        return outcome.remark_first(
+            f"{budget} simulations are too few for a search ({ROUNDS.min_budget}): base draws only."
+        )
     state = yield from _draw_base(search)
     try:
-        if state.base_rate >= TWO_STAGE.common_share:
+        if state.base_rate >= ROUNDS.common_share:
             return (yield from _run_monte_carlo(search, state))
         state = yield from _walk(search, state)
         state = yield from _run_rounds(search, state)
@@ -369,7 +339,7 @@ def _gives_up(search: TermSearch, state: SearchState) -> bool:
     They do not where a draw is worth less than `fallback_rate` failures, or less than a base draw.
     """
     worthless = state.last_rate < max(DOUBTS.fallback_rate, state.base_rate)
-    return worthless and search.left >= FALLBACK.min_fallback_budget
+    return worthless and search.left >= DOUBTS.min_fallback_budget
 
 
 def _estimate(search: TermSearch, state: SearchState) -> Steps:
@@ -444,7 +414,7 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
 def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on base draws; those made so far decided on this and do not count."""
     left = search.left_at_all
-    batch = TWO_STAGE.monte_carlo_batch if search.goal.target_cov is None else ROUNDS.target_batch
+    batch = ROUNDS.monte_carlo_batch if search.goal.target_cov is None else ROUNDS.target_batch
     method = MonteCarlo(n=left, batch=batch)
     outcome = yield from method.steps(search.inputs, replace(search.goal, max_sim=left), search.rng)
     return _after(search, state, outcome)

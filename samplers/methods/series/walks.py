@@ -1,16 +1,18 @@
 """Gradient walks, and terms with their gradients in standard normal space, where what they cost is counted."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import Goal, TermsOffer, request_gradients, request_terms, whole_simulations
 from samplers.methods.base import SimulationSteps, Simulator, noise_mask
-from samplers.methods.two_stage.settings import EXPLORATION, WALKS
+from samplers.methods.series.settings import WALKS
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
+
+_T = TypeVar("_T")
 
 DIFFERENCE = 1e-4
 """Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
@@ -24,6 +26,30 @@ def join_terms(parts: Sequence[Terms]) -> Terms:
     """Return the terms of some batches, at least one, as those of one."""
     f, values, ticks = (np.concatenate([getattr(one, name) for one in parts]) for name in ("f", "values", "ticks"))
     return Terms(f, values, ticks, parts[0].threshold, next((one.names for one in parts if one.names), ()))
+
+
+def answer_by_terms(
+    steps: Generator[FloatArray, FloatArray, _T], read: Callable[[FloatArray, Terms], FloatArray]
+) -> Generator[FloatArray, FloatArray, _T]:
+    """Run steps that ask for f (n,) at points (n, d), with terms requested in its place, from which `read` gives f."""
+    answer: FloatArray | None = None
+    while True:
+        try:
+            x = next(steps) if answer is None else steps.send(answer)
+        except StopIteration as end:
+            return cast(_T, end.value)
+        if len(x) == 0:
+            answer = np.empty(0)
+            continue
+        try:
+            terms = yield from request_terms(x)
+        except BaseException as error:
+            try:
+                steps.throw(error)
+            except StopIteration as end:
+                return cast(_T, end.value)
+            raise
+        answer = read(x, terms)
 
 
 class TermSimulator(Simulator):
@@ -211,7 +237,7 @@ def choose_terms(terms: Terms) -> tuple[list[int], list[int]]:
 def count_walks(n_main: int, n_others: int, budget: int, step: float) -> tuple[int, int]:
     """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps."""
     affordable = int(WALKS.budget_share * budget / (MIN_WALK_STEPS * step))
-    walkers = WALKS.walkers * min(1.0, budget / EXPLORATION.usual_budget)
+    walkers = WALKS.walkers * min(1.0, budget / WALKS.usual_budget)
     wanted = int(np.clip(walkers / max(n_main, 1), WALKS.min_walkers, WALKS.max_walkers))
     each = min(wanted, max(affordable // max(n_main, 1), 2))
     return each, min(n_others, max(affordable - each * n_main, 0) // WALKS.scouts)
