@@ -363,6 +363,8 @@ def _collect_texts(of_runs: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
 
 UNRESOLVED_SHARE = 0.1
 """Part of p from which what strata that are not resolved may add is worth a remark."""
+SETTLED = 1.8
+"""Upper end of a sum over its p up to which its run has converged: that of a c.o.v. of 0.3."""
 WIDEST = 1000.0
 """Upper end of an interval over its lower end from which on it says no more than its upper end; assumed."""
 FEW_SEARCHES = 10
@@ -391,11 +393,11 @@ def is_resolved(outcome: Outcome) -> bool:
 
 
 def _settle(part: Part, confidence: float) -> Part:
-    """Return a part that says whether it is resolved; if not, p_k may be as large as its base draws allow."""
+    """Return a part that says whether it is resolved; if not, p_k lies between 0 and what its base draws allow."""
     found, resolved = part.outcome, is_resolved(part.outcome)
     if found.p > 0 and not resolved:
         high = max(found.interval[1], clopper_pearson(0, found.base_draws, confidence)[1])
-        found = replace(found, interval=(found.interval[0], high))
+        found = replace(found, interval=(0.0, high))
     n_units = 0 if found.sample is None else found.sample.n_units
     return replace(part, outcome=found, resolved=resolved, n_units=n_units)
 
@@ -404,6 +406,13 @@ def may_add(parts: Sequence[Part], p: float) -> float:
     """Return what parts that are not resolved may add to p > 0; 0 where that is less than a tenth of p."""
     most = math.hypot(*(part.share * part.interval[1] for part in parts if not part.resolved))
     return most if most > UNRESOLVED_SHARE * p > 0 else 0.0
+
+
+def find_low_end(parts: Sequence[Part]) -> float:
+    """Return the lower end of the sum, which is that of the parts that are resolved."""
+    known = [part for part in parts if part.resolved]
+    below = math.hypot(*(part.share * (part.p - part.interval[0]) for part in known))
+    return max(0.0, math.fsum(part.share * part.p for part in known) - below)
 
 
 def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...]) -> Outcome:
@@ -415,7 +424,8 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
 
     so that a part without a failure raises the upper end alone. What is said of such a part is a remark where other
     parts failed: its upper end rests on the draws from its base. So does that of a part whose search found failures,
-    but too few to say how likely they are (`is_resolved`).
+    but too few to say how likely they are (`is_resolved`), and the lower end leaves its p_k out. A sum has converged
+    where all parts have and its own upper end is below 1.8 p.
 
     References:
         Zou and Donner, "Construction of confidence limits about effect measures: a general approach", Statistics in
@@ -425,9 +435,11 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
     of_sum = [part.share * part.p / p if p > 0 else math.nan for part in parts]
     parts = tuple(replace(_settle(part, confidence), of_sum=of) for part, of in zip(parts, of_sum, strict=True))
     found, present = [part for part in parts if part.p > 0], {part.outcome.status for part in parts}
-    below = math.hypot(*(part.share * (part.p - part.interval[0]) for part in parts))
+    low = find_low_end(parts)
     above = math.hypot(*(part.share * (part.interval[1] - part.p) for part in parts))
     status = next((each for each in STATUS_PRIORITY if each in present), Status.NO_HITS)
+    if status is Status.CONVERGED and p + above > SETTLED * p:
+        status = Status.BUDGET
     warnings, remarks = list[str](), list[str]()
     for part in parts:
         resolved = p == 0 or part.outcome.status is not Status.NO_HITS
@@ -440,7 +452,7 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
     known = all(part.outcome.draw_weights for part in simulated)
     return Outcome(
         p=min(p, 1.0),
-        interval=(max(p - below, 0.0), min(p + above, 1.0)),
+        interval=(low, min(p + above, 1.0)),
         cov=math.hypot(*(part.of_sum * part.cov for part in found)) if found else math.inf,
         status=status if p > 0 or status is Status.STOPPED else Status.NO_HITS,
         warnings=tuple(warnings),

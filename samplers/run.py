@@ -33,6 +33,7 @@ from samplers.replicate import (
     Replicate,
     combine,
     count_simulations,
+    find_low_end,
     may_add,
     meets_target,
     needs_another,
@@ -406,13 +407,15 @@ class Run:
         if self._on_error != "bound":
             return low, high
         if outcome.parts:
-            p = [part.share * part.p * (1 - part.outcome.no_outcome_share) for part in outcome.parts]
-            lows = [part.share * self._find_ends(part.outcome)[0] for part in outcome.parts]
-            return max(0.0, math.fsum(p) - math.hypot(*np.subtract(p, lows))), high  # as in `sum_strata`
+            return find_low_end([replace(part, outcome=self._keep_known(part.outcome)) for part in outcome.parts]), high
         if outcome.counts is None:
             return low * known, high
         hits, n = outcome.counts
         return clopper_pearson(round(hits * known), n, self._goal.confidence)[0], high
+
+    def _keep_known(self, outcome: Outcome) -> Outcome:
+        """Return the outcome of a part with p and the lower end of the failures that have an outcome."""
+        return replace(outcome, p=outcome.p * (1 - outcome.no_outcome_share), interval=self._find_ends(outcome))
 
     def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""

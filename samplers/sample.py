@@ -42,7 +42,8 @@ class Status(str, Enum):
     NO_HITS = "no_hits"
     """It came to its end without seeing a failure: p = 0, one-sided interval."""
     BUDGET = "budget"
-    """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met."""
+    """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met, or a sum
+    over strata has an upper end above 1.8 p."""
     STOPPED = "stopped"
     """Someone stopped it: the time limit or a callback."""
     STALLED = "stalled"

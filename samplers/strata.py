@@ -17,9 +17,10 @@ Where nothing fails in a stratum, or too little to be believed (`samplers.replic
 left are plain draws, which bring its upper end down: so are the `plain_draws` that a problem offers where there is no
 max_sim, as it does where they take seconds.
 
-Where the method is `Auto`, pilots are plain draws, and a stratum in which some of them failed goes on with plain draws:
-where p_k is above some 0.005 a search gains little, and it may miss one of many regions. So do all strata where there
-are not 300 simulations for a search of each that hardly failed.
+Where the method is `Auto`, pilots are plain draws, and a stratum in which 0.004 of them failed goes on with plain
+draws: a search gains little there, and it may miss one of many regions. So do strata that cannot add a tenth of p, and
+all where there are not 300 simulations for a search of each of the others. Without max_sim and target a sum has 7,000
+simulations for each stratum, 1,000 of them in its pilot; 6,000 for each search, and the rest where the error is.
 
 References:
     Neyman, "On the two different aspects of the representative method", Journal of the Royal Statistical Society 97,
@@ -40,6 +41,7 @@ from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Steppi
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     NOT_KNOWN,
+    UNRESOLVED_SHARE,
     InputsOnly,
     Replicate,
     combine,
@@ -57,8 +59,11 @@ FEWEST = 20
 """Simulations for each stratum up to which there are no pilots: all are made at once, in equal parts."""
 PILOT_DRAWS = 1000
 """Draws of a pilot of plain draws where there is no max_sim."""
-OFTEN = 4
-"""Failures of a pilot of plain draws from which its stratum needs no search."""
+OFTEN = 0.004
+"""Share of the draws of a pilot that fails from which its stratum needs no search: it would gain a factor of 2 ..."""
+FEWEST_HITS = 2
+"""... with at least this many failures. As these stay in the estimate, p would be too large by a quarter where one were
+enough, by at most a tenth with two."""
 LEAST_SEARCH = 300
 """Simulations of a search in each stratum that hardly failed, at least; else all have plain draws. A search of fewer
 may meet nothing where plain draws do: as what met a failure counts, p would be too large on average, by a third with
@@ -113,6 +118,10 @@ class _Sum:
         """Simulations of the runs behind the outcomes."""
         self.trace = list[Level]()
         self.n_sim, self.stopped, self.at_limit = 0, False, set[int]()
+        self.most = goal.max_sim
+        """Simulations that are planned; None where a target, a method or the time of plain draws says when to end."""
+        if self.most is None and goal.target_cov is None and self.chooses and not self.plain_draws:
+            self.most = len(self.strata) * (PILOT_DRAWS + PLENTY)
         self.searched = set[int]()
         """Strata that had a run of the method chosen, or are not to have one."""
 
@@ -158,9 +167,9 @@ class _Sum:
                 late = part.p > 0 and part.cov > limit and whole.cov > target
                 may_add_most = not part.resolved and part.share * part.interval[1] > whole.p
                 use[i] = i not in self.at_limit and (late or may_add_most)
-        elif self.goal.max_sim is None:
+        elif self.most is None:
             return []
-        known = self.goal.max_sim is not None
+        known = self.most is not None
         sizes: list[int | None] = [int(n) for n in self._allocate(use, whole.parts)] if known else [None] * k
         methods = [self._find_method(i) for i in range(k)]
         for i, size in enumerate(sizes):
@@ -171,27 +180,35 @@ class _Sum:
     def _plan_searches(self) -> list[Task]:
         """Return the runs after pilots of plain draws, first those of the strata that hardly failed in them.
 
-        They have half of what is left, to a target that of a pilot, or else the simulations that their method likes;
-        the others then as many plain draws as cost seconds.
+        Those that may add to the sum have half of what is left, to a target that of a pilot, or else the simulations
+        that their method likes; the others then as many plain draws as cost seconds.
         """
-        k, left, target = len(self.parts), self.goal.max_sim and self.goal.max_sim - self.n_sim, self.goal.target_cov
-        rare = [i for i in range(k) if (self.parts[i].outcome.counts or (0, 0))[0] < OFTEN]
-        if left is not None and left < 2 * LEAST_SEARCH * len(rare):
-            self.searched |= {*rare}
+        k, left, target = len(self.parts), self.most and self.most - self.n_sim, self.goal.target_cov
+        limited, p = self.goal.max_sim is not None, sum(part.share * part.p for part in self.parts)
+        seldom = {i for i in range(k) if not self._fails_often(i)}
+        rare = [i for i in seldom if self.parts[i].share * self.parts[i].interval[1] > UNRESOLVED_SHARE * p]
+        if limited and left is not None and left < 2 * LEAST_SEARCH * len(rare):
             rare = []
-        if rare and (left is not None or target is not None):
-            most = None if left is None else min(PLENTY, left // 2 // len(rare))
-            return [(i, most, target if left is not None else max(target or 0.0, PILOT_COV), None) for i in rare]
-        if left is not None or target is not None:
+        self.searched |= seldom - {*rare}
+        if left is None and target is None:
+            draws = {i: (self.plain_draws, None, PlainDraws()) for i in range(k) if i not in rare}
+            return [(i, *draws.get(i, (None, None, None))) for i in range(k)]
+        if not rare:
             return self._plan_more()
-        plenty = self.plain_draws or PLENTY
-        return [(i, None if i in rare else plenty, None, None if i in rare else PlainDraws()) for i in range(k)]
+        if left is None:
+            return [(i, None, max(target or 0.0, PILOT_COV), None) for i in rare]
+        return [(i, min(PLENTY, left // (1 + limited) // len(rare)), target, None) for i in rare]
+
+    def _fails_often(self, stratum: int) -> bool:
+        """Return whether so many plain draws of a stratum failed that a search would gain little."""
+        hits, n = self.parts[stratum].outcome.counts or (0, 0)
+        return hits >= max(FEWEST_HITS, OFTEN * n)
 
     def _find_method(self, stratum: int) -> Stepping | None:
-        """Return plain draws for a stratum in whose pilot some failed, or that was searched in vain; else None."""
-        hits, _ = self.parts[stratum].outcome.counts or (0, 0)
-        in_vain = stratum in self.searched and (hits > 0 or self._is_unresolved(stratum))
-        return PlainDraws() if self.chooses and (hits >= OFTEN or in_vain) else None
+        """Return plain draws for a stratum that often fails, or that was searched in vain; else None."""
+        drawn = self.parts[stratum].outcome.counts is not None
+        in_vain = stratum in self.searched and (drawn or self._is_unresolved(stratum))
+        return PlainDraws() if self.chooses and (self._fails_often(stratum) or in_vain) else None
 
     def _has_draws_next(self, stratum: int) -> bool:
         """Return whether plain draws come next in a stratum that is not resolved: all count in its upper end."""
@@ -204,7 +221,7 @@ class _Sum:
 
     def _plan_plain_draws(self) -> list[Task]:
         """Return plain draws for the strata that are not resolved, of the simulations left by their shares."""
-        n = self.plain_draws if self.goal.max_sim is None else self.goal.max_sim - self.n_sim
+        n = self.plain_draws if self.most is None else self.most - self.n_sim
         empty = [i for i in range(len(self.parts)) if self._is_unresolved(i)]
         whole = sum(self.parts[i].share for i in empty)
         drawn = [(i, int(n * self.parts[i].share / whole)) for i in empty]
@@ -219,7 +236,7 @@ class _Sum:
         least = np.where(adds, 0.0, self.behind)
         sizes = np.zeros(len(parts))
         while use.any():
-            sizes = np.floor((self.goal.budget - self.n_sim) * need * use / (need * use).sum())
+            sizes = np.floor(((self.most or 0) - self.n_sim) * need * use / (need * use).sum())
             gain = np.where(use, sizes - least, math.inf)
             if gain.min() > 0:
                 break

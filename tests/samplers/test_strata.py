@@ -106,8 +106,9 @@ def test_unbiased_and_covered_with_few_simulations():
     assert found.std() < 0.95 * math.sqrt(p * (1 - p) / 100)  # worth more than 100 draws of the whole
 
 
-def test_simulations_go_where_the_error_of_the_sum_is():
-    result = samplers.estimate(even((0.5, 0.5), (2.5, 0.0)), "mc", seed=0, max_sim=8000)
+@pytest.mark.parametrize(("method", "max_sim"), [("mc", 8000), ("auto", None)])
+def test_simulations_go_where_the_error_of_the_sum_is(method, max_sim):
+    result = samplers.estimate(even((0.5, 0.5), (2.5, 0.0)), method, seed=0, max_sim=max_sim)
     small, large = result.parts  # standard deviations of 0.079 and 0.5
     assert small.n_sim >= 1000  # its pilot
     assert large.n_sim / result.n_sim == pytest.approx(0.5 / 0.579, abs=0.08)
@@ -561,6 +562,7 @@ def test_simulations_go_where_the_upper_end_of_the_sum_rests() -> None:
         result = samplers.estimate(problem, seed=0, max_sim=5000, **goal)
         nothing, _ = result.parts
         assert nothing.n_sim > 4000 and result.interval[0] < 6e-5 < result.interval[1] < 1.5 * 3.7 / 4000
+        assert result.status is Status.BUDGET  # 15 p is no end
 
 
 class Misled(samplers.Method):
@@ -591,11 +593,13 @@ def test_what_few_searches_describe_badly_or_leave_open_by_decades_is_an_upper_e
 ) -> None:
     """Three decades: from 1.5e-14 to 1.5e-11."""
     problem = StratifiedProblem([Stratum("rare", 0.9, half_space(40.0)), Stratum("often", 0.1, half_space(1.0))])
-    rare = samplers.estimate(problem, Misled(failing, lineages, low), seed=0, max_sim=5000).parts[0]
+    result = samplers.estimate(problem, Misled(failing, lineages, low), seed=0, max_sim=5000)
+    rare, often = result.parts
     assert rare.resolved == believed
     if believed:
         assert rare.interval[1] == pytest.approx(1.5e-11)
     else:
         draws = rare.outcome.base_draws  # 200 of two searches, the others plain draws of their own
         assert draws > 1200 and rare.interval[1] == pytest.approx(1 - 0.025 ** (1 / draws))
-        assert "not resolved (1.0e-11 found)" in str(rare)
+        assert "not resolved (1.0e-11 found)" in str(rare) and rare.interval[0] == 0
+        assert result.interval[0] == pytest.approx(0.1 * often.interval[0], rel=1e-12)
