@@ -4,7 +4,7 @@ Five sources. Subset simulation and lines of descent follow f downhill; the othe
 fails, so that plateaus, ties, jumps and misleading level sets do not matter to them:
 
 1. Draws from the base distribution, and wide ones from N(0, s^2 I): a half-space at distance beta fails with
-   probability Phi(-beta / s), whatever the dimension (`find_wide_failures`).
+   probability Phi(-beta / s), whatever the dimension.
 2. Subset simulation from the base draws, for regions too small to be hit by wide draws (`descend_levels`).
 3. Lines of descent from low base draws, each a trial of its own of which region is found (`walk_lines`). They
    use nothing of the subset simulation, and are walked in the same batches (`join_batches`).
@@ -14,8 +14,7 @@ fails, so that plateaus, ties, jumps and misleading level sets do not matter to 
 
 In subset simulation points descend from the few that were lowest at first: of 500 base draws three to five effectively
 have descendants among the failures, and a region that none of these leads to is not found. No line of descent ends
-because another one is lower: each is a trial of its own of which region is found, and nothing else: its end is no draw
-given failure.
+because another one is lower. Its end is no draw given failure.
 
 Slopes: in dozens of dimensions some hundred failing points do not show in which directions failures differ from
 N(0, I). Gradients of f at a handful of points do, by finite differences, where few directions matter or f is the least
@@ -35,7 +34,6 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
 from samplers.mcmc import (
@@ -59,10 +57,16 @@ from samplers.methods.two_stage.regions import (
     grow_regions,
     label_regions,
 )
-from samplers.methods.two_stage.settings import EXPLORATION, LINES, SLOPES, SUBSPACE
+from samplers.methods.two_stage.settings import BUDGET, EXPLORATION, HIGH_DIM, LINES, SLOPES
 from samplers.problem import FloatArray
 from samplers.sample import Level, Status, next_level
 
+LEAST_SLOPES = 4
+"""Gradients that two directions can be told from many with."""
+LINE_STARTS = 4
+"""Lines of each region from which chains start."""
+CHAIN_COST = 25
+"""Simulations that a chain needs at most before it is sorted: bisection, its steps, points half way."""
 _A = TypeVar("_A")
 _B = TypeVar("_B")
 _T = TypeVar("_T")
@@ -136,9 +140,9 @@ class ExplorationPlanner:
         threshold = next_level(points.f, EXPLORATION.level_fraction, self.gamma)
         if threshold == self.gamma:
             return Status.CONVERGED
-        if threshold is None or depth >= EXPLORATION.max_levels:
+        if threshold is None or depth >= 30:
             return Status.STALLED
-        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // EXPLORATION.points_per_seed]
+        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // 3]
         steps = max(1, math.ceil(self.n / len(seeds)) - 1)
         if n_sim + steps * len(seeds) > self.budget:
             return Status.BUDGET
@@ -154,7 +158,7 @@ def descend_levels(
 
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
-    kernel = Kernel("conditional", EXPLORATION.initial_scale, EXPLORATION.level_acceptance)
+    kernel = Kernel("conditional", 0.6, EXPLORATION.level_acceptance)
     gamma = goal.gamma
     planner = ExplorationPlanner(gamma, n, most - simulator.n_sim)
     levels, thresholds = list[Growth](), list[float]()
@@ -189,103 +193,37 @@ def _upper_end(levels: list[Chains], thresholds: list[float], goal: Goal) -> flo
     return judge_levels(levels[-1], goal, trace)[1][1]
 
 
-def choose_roots(f: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the indices of at most n base draws with outcomes f (m,) to start from: a random part of the lowest."""
-    lowest = np.lexsort((rng.random(len(f)), f))[: max(int(LINES.root_share * len(f)), n)]
-    return rng.permutation(lowest)[:n]
-
-
 def walk_lines(
-    simulator: Simulator,
-    u: FloatArray,
-    f: FloatArray,
-    gamma: float,
-    scale: float,
-    rng: np.random.Generator,
-    room: int | None = None,
+    simulator: Simulator, u: FloatArray, f: FloatArray, gamma: float, scale: float, rng: np.random.Generator
 ) -> SimulationSteps[tuple[FloatArray, NDArray[np.bool_]]]:
     """Walk downhill from points u (n, d) with outcomes f (n,); return where the lines end, and which of them fail.
 
-    A step has one try or more, v = sqrt(1 - s^2) u + s xi with xi ~ N(0, I); in the first of them xi is that of the
-    step before if that was a gain. The line goes to the first try with f(v) < f(u), else to the first with f(v) = f(u).
-    All lines take a step in one batch: where half of them have arrived, the others have two tries each. The longer it
-    takes, the fewer lines go on. They end together: when all have arrived, at twice the median time of arrival once
-    most have, where hardly any arrives, or at the limit of simulations (times `scale`); with `room` they have so many,
-    however few arrive.
+    A step tries v = sqrt(1 - s^2) u + s xi, with xi ~ N(0, I), or that of the step before if it was a gain, and goes
+    there if f(v) <= f(u). The longer it takes, the fewer lines go on: where failures are far off, few lines that arrive
+    are better than many that do not. They end when all have arrived, at twice the median time of arrival once most
+    have, or at the limit of simulations (times `scale`).
     """
     u, f, n = u.copy(), f.copy(), len(f)
-    s, kept, gained = np.full(n, LINES.initial_step), np.zeros_like(u), np.zeros(n, dtype=bool)
-    arrival = np.where(f <= gamma, 0.0, np.inf)
-    used = time = 0
-    while np.isinf(arrival).any() and not _is_late(arrival, time, used / scale, room):
-        on = np.flatnonzero(np.isinf(arrival))
+    s, kept, gained = np.full(n, 0.35), np.zeros_like(u), np.zeros(n, dtype=bool)
+    arrival, used, time = np.where(f <= gamma, 0.0, np.inf), 0, 0
+    while np.isinf(arrival).any() and used < LINES.limit * scale:
+        arrived = np.isfinite(arrival)
+        if arrived.mean() >= 0.6 and time >= 2 * float(np.median(arrival[arrived])):
+            break
+        on = np.flatnonzero(~arrived)
         on = on[on < max(1, scale * LINES.steps / max(time, 1))]
         if len(on) == 0:
             break
-        tries = min(n // len(on), LINES.most_tries)
-        xi = rng.standard_normal((len(on), tries, u.shape[1]))
-        xi[gained[on], 0] = kept[on[gained[on]]]
-        v = np.sqrt(1 - s[on, None, None] ** 2) * u[on, None] + s[on, None, None] * xi
-        new = (yield from simulator.evaluate(v.reshape(-1, u.shape[1]))).reshape(xi.shape[:2])
-        used, time = used + new.size, time + 1
-        fresh = np.ones(new.shape, dtype=bool)
-        fresh[:, 0] = ~gained[on]
-        change = LINES.adaptation * (((new <= f[on, None]) - LINES.acceptance) * fresh).sum(axis=1)
-        s[on] = np.clip(s[on] * np.exp(change), *LINES.step_range)
-        best = np.arange(len(on)), _choose_tries(f[on], new)
-        kept[on], gained[on], moves = xi[best], new[best] < f[on], new[best] <= f[on]
-        u[on[moves]], f[on[moves]] = v[best][moves], new[best][moves]
+        xi = np.where(gained[on, None], kept[on], rng.standard_normal((len(on), u.shape[1])))
+        v = np.sqrt(1 - s[on, None] ** 2) * u[on] + s[on, None] * xi
+        new = yield from simulator.evaluate(v)
+        used, time, better = used + len(on), time + 1, new <= f[on]
+        change = 0.5 * np.where(gained[on], 0.0, better - LINES.acceptance)  # of log s, by fresh steps alone
+        s[on] = np.clip(s[on] * np.exp(change), 0.03, 1.0)
+        kept[on], gained[on] = xi, new < f[on]
+        u[on[better]], f[on[better]] = v[better], new[better]
         arrival[on[f[on] <= gamma]] = time
     return u, np.isfinite(arrival)
-
-
-def _choose_tries(f: FloatArray, new: FloatArray) -> NDArray[np.int64]:
-    """Return the number of the try (n,) that each line goes to from f (n,), if any: the first gain, else the first tie.
-
-    Not the best one, which would be more often where f falls steeply, whichever region that is.
-    """
-    gain, tie = new < f[:, None], new == f[:, None]
-    return np.asarray(np.where(gain.any(axis=1), gain.argmax(axis=1), tie.argmax(axis=1)))
-
-
-def _is_late(arrival: FloatArray, time: int, used: float, room: int | None) -> bool:
-    """Return whether the lines that are still on their way are given up."""
-    arrived = np.isfinite(arrival)
-    share = float(arrived.mean())
-    if share >= LINES.most_arrived and time >= LINES.patience * float(np.median(arrival[arrived])):
-        return True
-    if room is not None:
-        return used >= room
-    return used >= LINES.limit or (used >= LINES.first_look and share < LINES.few_arrived)
-
-
-TINY = 1e-300
-"""Least length to divide by."""
-
-
-def _choose_wide(u: FloatArray, scale: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:
-    """Return at most n of failing wide draws u (k, d) of N(0, s^2 I), s = scale (k,): half of them the least wide ones.
-
-    Each of the rest is the one furthest in direction from all before it: no region that was met is left out by
-    chance, as one in six of six_d8 was in 1 run of 60.
-    """
-    order = np.lexsort((rng.random(len(scale)), scale))
-    near, rest = order[: n // 2], rng.permutation(order[n // 2 :])
-    if len(order) > n:
-        rest = rest[_spread_directions(u[near], u[rest], n - len(near))]
-    return np.take(u, np.append(near, rest), axis=0)
-
-
-def _spread_directions(known: FloatArray, u: FloatArray, n: int) -> NDArray[np.intp]:
-    """Return the rows of n of the points u (m, d), m >= n, one by one the furthest in direction from all before it."""
-    known, u = (points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), TINY) for points in (known, u))
-    cosine = (u @ known.T).max(axis=1, initial=-1.0)
-    chosen = np.empty(n, dtype=np.intp)
-    for place in range(n):
-        k = chosen[place] = int(cosine.argmin())
-        cosine = np.maximum(cosine, u @ u[k])
-        cosine[k] = np.inf
-    return chosen
 
 
 def draw_isotropic(
@@ -299,14 +237,48 @@ def draw_isotropic(
     return ComponentDraws(components, counts, u, f)
 
 
-def bisect_towards_origin(simulator: Simulator, u: FloatArray, gamma: float, steps: int) -> SimulationSteps[FloatArray]:
-    """Move failing points (n, d) towards the origin along their rays, by bisection; they still fail."""
+def bisect_towards_origin(simulator: Simulator, u: FloatArray, gamma: float) -> SimulationSteps[FloatArray]:
+    """Move failing points (n, d) towards the origin along their rays, to an eighth of the way; they still fail."""
     safe, failing = np.zeros(len(u)), np.ones(len(u))
-    for _ in range(steps):
+    for _ in range(3):
         middle = 0.5 * (safe + failing)
         fails = (yield from simulator.evaluate(u * middle[:, None])) <= gamma
         failing, safe = np.where(fails, middle, failing), np.where(fails, safe, middle)
     return u * failing[:, None]
+
+
+def contract(
+    simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator
+) -> SimulationSteps[FloatArray]:
+    """Move failing points (n, d) that are unlikely by their length to likely ones: drop random directions of them.
+
+    A point of N(0, I) has |u|^2 = d + 2 sqrt(2 d) or less in 98 of 100 cases. From further out than that and 40 more,
+    chains of a dozen steps do not come to where failures are likely. Half of the directions are dropped at once at
+    first, half as many after a try that does not fail.
+    """
+    u, dim = u.copy(), u.shape[1]
+    size = np.full(len(u), dim // 2)
+    for _ in range(EXPLORATION.contractions if dim > 1 else 0):
+        far = np.flatnonzero((u**2).sum(axis=1) > dim + 2 * math.sqrt(2 * dim) + 40)
+        shorter = _drop_directions(u[far], size[far], rng)
+        fails = (yield from simulator.evaluate(shorter)) <= gamma
+        u[far[fails]] = shorter[fails]
+        size[far[~fails]] = np.maximum(size[far[~fails]] // 2, 1)
+    return u
+
+
+def _drop_directions(u: FloatArray, n: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
+    """Return points u (k, d) without their components in n (k,) random directions each, 0 < n < d.
+
+    The component in a random subspace is |u| (s a + sqrt(s (1 - s)) b), with a the direction of u, b a random one
+    across it and s ~ Beta(n / 2, (d - n) / 2), the share of |u|^2.
+    """
+    length = np.linalg.norm(u, axis=1, keepdims=True)
+    along, across = u / length, rng.standard_normal(u.shape)
+    across -= (across * along).sum(axis=1, keepdims=True) * along
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    s = rng.beta(n / 2, (u.shape[1] - n) / 2)[:, None]
+    return np.asarray(u - length * (s * along + np.sqrt(s * (1 - s)) * across))
 
 
 class Sizes(NamedTuple):
@@ -316,24 +288,22 @@ class Sizes(NamedTuple):
     base: int  # base draws
     wide: tuple[tuple[float, int], ...]  # (s, draws)
     level: int  # points of each level of subset simulation
-    starts: int  # chains from wide failures at most
-    level_starts: int  # chains from failures of subset simulation at most, more where wide draws fail less often
+    starts: int  # chains from wide failures at most; as many more from failures of the lines and the levels
     most: int  # simulations after which no further level is begun
     limit: int  # simulations of the whole exploration
 
     @classmethod
     def within(cls, budget: int) -> "Sizes":
         """Return the sizes for a budget."""
-        usual = EXPLORATION.usual_budget
+        usual = BUDGET.usual
         scale = budget / usual if budget < usual else math.sqrt(budget / usual)
         return cls(
             scale=scale,
             base=round(EXPLORATION.base * scale),
             wide=tuple((width, round(n * scale)) for width, n in EXPLORATION.wide),
-            level=max(EXPLORATION.least_level, round(EXPLORATION.level * scale)),
-            starts=max(EXPLORATION.least_starts, round(EXPLORATION.starts * scale)),
-            level_starts=max(EXPLORATION.least_level_starts, round(EXPLORATION.level_starts * scale)),
-            most=int(EXPLORATION.descent_share * budget),
+            level=max(100, round(EXPLORATION.level * scale)),
+            starts=max(10, round(EXPLORATION.starts * scale)),
+            most=int(EXPLORATION.level_share * budget),
             limit=int(EXPLORATION.share * budget),
         )
 
@@ -344,69 +314,45 @@ def find_regions(
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base, gamma = int(first.counts[0]), goal.gamma
     base_u, base_f = first.u[:n_base], first.f[:n_base]
-    drawn = ComponentDraws(first.components[1:], first.counts[1:], first.u[n_base:], first.f[n_base:])
     for_levels, for_lines = rng.spawn(2)
-    (descent, wide), (ends, line_roots) = yield from join_batches(
-        _pass_levels(simulator, base_u, base_f, drawn, goal, sizes, for_levels),
+    descent, (ends, line_roots) = yield from join_batches(
+        descend_levels(simulator, base_u, base_f, goal, sizes.level, sizes.most, for_levels),
         _find_lines(simulator, base_u, base_f, gamma, sizes.scale, for_lines),
     )
+    wide_u = first.u[n_base:][first.f[n_base:] <= gamma]
+    density = mixture_log_ratio(log_ratios(first.components[1:], wide_u), first.counts[1:].astype(np.float64))
     roots = len(np.union1d(descent.roots, line_roots))
-    wide_fails = wide.f <= gamma
-    wide_u = wide.u[wide_fails]
-    density = mixture_log_ratio(log_ratios(wide.components, wide_u), wide.counts.astype(np.float64))
     discovery = Discovery(count_lineages(roots, -density), descent.ceiling)
-    most = max(2, (sizes.limit - simulator.n_sim) // EXPLORATION.chain_cost)
-    scales = [one.scale for one in wide.components if isinstance(one, IsotropicNormal)]
-    chosen = _choose_wide(wide_u, np.repeat(scales, wide.counts)[wide_fails], min(sizes.starts, most), rng)
+    most = max(2, (sizes.limit - simulator.n_sim) // CHAIN_COST)
+    chosen = rng.permutation(wide_u)[: min(sizes.starts, most)]
     far, (labels, _) = yield from join_batches(
-        bisect_towards_origin(simulator, chosen, gamma, EXPLORATION.bisections),
-        label_regions(simulator, ends, gamma, sizes.limit),
+        bisect_towards_origin(simulator, chosen, gamma), label_regions(simulator, ends, gamma, sizes.limit)
     )
-    if simulator.inputs.dim > SUBSPACE.high_dim and labels.max(initial=-1) + 1 >= LINES.many_regions:
+    n_regions = int(labels.max(initial=-1)) + 1
+    if simulator.inputs.dim > HIGH_DIM and n_regions >= LINES.many_regions:
         region = Region(ends[:, None], descent.u, descent.f)
         return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
-    order, n_regions = rng.permutation(len(ends)), int(labels.max(initial=-1)) + 1
-    few = [order[labels[order] == k][: LINES.starts] for k in range(n_regions)]  # of each region
+    order = rng.permutation(len(ends))
+    few = [order[labels[order] == k][:LINE_STARTS] for k in range(n_regions)]  # of each region
     near = np.take(ends, np.concatenate([np.empty(0, dtype=np.int64), *few]), axis=0)
-    others = min(max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far)), most - len(far))
-    starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others - len(near), 0)]])
+    others = min(2 * sizes.starts, most) - len(far) - len(near)  # what wide draws do not reach, the levels do
+    starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others, 0)]])
     if len(starts) == 0:
         return ExplorationResult([], noisy=False, discovery=discovery)
-    result = yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng)
-    return result._replace(discovery=discovery)
-
-
-def _pass_levels(
-    simulator: Simulator,
-    u: FloatArray,
-    f: FloatArray,
-    drawn: ComponentDraws,
-    goal: Goal,
-    sizes: Sizes,
-    rng: np.random.Generator,
-) -> SimulationSteps[tuple[SubsetPoints, ComponentDraws]]:
-    """Run subset simulation from base draws u (n, d), f (n,); make further wide draws if the levels went deep."""
-    descent = yield from descend_levels(simulator, u, f, goal, sizes.level, sizes.most, rng)
-    scale = -float(ndtri(10 ** -(descent.levels + 0.5))) / EXPLORATION.depth_ratio
-    if scale > EXPLORATION.deep_scale:
-        n = round(EXPLORATION.deep_draws * sizes.scale)
-        deep = yield from draw_isotropic(simulator, ((scale, n),), rng)
-        drawn = ComponentDraws(
-            [*drawn.components, *deep.components],
-            np.concatenate([drawn.counts, deep.counts]),
-            np.concatenate([drawn.u, deep.u]),
-            np.concatenate([drawn.f, deep.f]),
-        )
-    return descent, drawn
+    starts = yield from contract(simulator, starts, gamma, rng)
+    result = yield from grow_regions(simulator, starts, gamma, sizes.limit, rng)
+    return result._replace(levels=descent.levels, discovery=discovery)
 
 
 def _find_lines(
     simulator: Simulator, u: FloatArray, f: FloatArray, gamma: float, scale: float, rng: np.random.Generator
 ) -> SimulationSteps[tuple[FloatArray, NDArray[np.int64]]]:
-    """Walk lines from base draws u (n, d), f (n,); return their failing ends (k, d), moved inwards, and roots (k,)."""
-    roots = choose_roots(f, max(1, round(scale * LINES.n)), rng)
+    """Walk lines from low base draws u (n, d), f (n,); return their failing ends (k, d), moved inwards, and roots."""
+    n = max(1, round(scale * LINES.n))
+    lowest = np.lexsort((rng.random(len(f)), f))[: max(int(0.1 * len(f)), n)]
+    roots = rng.permutation(lowest)[:n]
     ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng)
-    near = yield from bisect_towards_origin(simulator, ends[failing], gamma, EXPLORATION.bisections)
+    near = yield from bisect_towards_origin(simulator, ends[failing], gamma)
     return near, roots[failing]
 
 
@@ -423,22 +369,22 @@ def find_slopes(
     where there are too many directions, or where the batch before was explained by what was known.
     """
     dim = simulator.inputs.dim
-    short = exploration.scattered or dim > SUBSPACE.high_dim
-    n = min(int((SLOPES.high_dim_share if short else SLOPES.share) * room / (dim + 1)), SLOPES.most)
-    if dim < SLOPES.min_dim or n < SLOPES.least or exploration.noisy or not exploration.regions:
+    short = exploration.scattered or dim > HIGH_DIM
+    n = min(int(SLOPES.shares[short] * room / (dim + 1)), SLOPES.most)
+    if dim < SLOPES.min_dim or n < LEAST_SLOPES or exploration.noisy or not exploration.regions:
         return None
     points = _collect_points(exploration, gamma, rng)
-    first = max(n - n // 2, SLOPES.least)
+    first = max(n - n // 2, LEAST_SLOPES)
     chosen = np.argsort(points.turns, kind="stable")[:first]
-    slopes = yield from _differentiate(simulator, points.u[chosen], SLOPES.step)
+    slopes = yield from _differentiate(simulator, points.u[chosen], 0.05)
     for size in ((n - first + 1) // 2, (n - first) // 2):
         if not _have_few_directions(slopes):
             return None
         axes, points = _leading_directions(slopes), points.leave_out(chosen)
         chosen = _choose_unexplained(points, size, axes)
-        more = yield from _differentiate(simulator, points.u[chosen], SLOPES.step)
+        more = yield from _differentiate(simulator, points.u[chosen], 0.05)
         slopes = np.concatenate([slopes, more])
-        if ((more @ axes) ** 2).sum() >= SLOPES.explained * len(more):
+        if ((more @ axes) ** 2).sum() >= 0.99 * len(more):
             break
     return _leading_directions(slopes) if _have_few_directions(slopes) else None
 
@@ -510,7 +456,7 @@ def _have_few_directions(slopes: FloatArray) -> bool:
     (sum s^2)^2 / sum s^4.
     """
     k, dim = slopes.shape
-    if k < SLOPES.least:
+    if k < LEAST_SLOPES:
         return False
     squares = np.linalg.svd(slopes, compute_uv=False) ** 2
     return bool(squares.sum() ** 2 / (squares**2).sum() <= SLOPES.few * k * dim / (k + dim))
@@ -519,5 +465,5 @@ def _have_few_directions(slopes: FloatArray) -> bool:
 def _leading_directions(slopes: FloatArray) -> FloatArray:
     """Return the principal directions (d, r) of unit gradients (k, d)."""
     _, sizes, axes = np.linalg.svd(slopes, full_matrices=False)
-    used = sizes**2 > SLOPES.least_part * len(slopes)
+    used = sizes**2 > 0.005 * len(slopes)
     return np.asarray(axes[used][: SLOPES.most_axes].T)

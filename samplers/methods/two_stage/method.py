@@ -1,7 +1,7 @@
 """TwoStage: find every failure region, then estimate from a sample of mixtures made for them."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.mcmc import RootedPoints
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share, offer_of
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import (
     ComponentDraws,
     Method,
@@ -23,23 +23,22 @@ from samplers.methods.two_stage.exploration import Sizes, draw_isotropic, find_r
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.refinement import (
     RefinementState,
+    badly_described,
     build_proposal,
     refine_once,
     start_refinement,
     typical_weights,
 )
-from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval
-from samplers.methods.two_stage.settings import EXPLORATION, FALLBACK, REFINEMENT, TWO_STAGE
+from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval, is_noisy
+from samplers.methods.two_stage.settings import BUDGET, EXPLORATION, FALLBACK, PROPOSAL
 from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
     StratifiedSample,
     check_base_draws,
     check_discovery,
-    check_efficiency,
     check_regions,
     check_rounds,
 )
-from samplers.methods.two_stage.terms_alone import TermRecord, explore_terms
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import DrawWeights, Interval, Sample, Status, binomial_cov, effective_sample_size
 
@@ -48,17 +47,16 @@ from samplers.sample import DrawWeights, Interval, Sample, Status, binomial_cov,
 class TwoStage(Method):
     """Explore, then estimate from draws that had no part in it; few simulations for any number of failure regions.
 
-    1. *Exploration* (`exploration.py`, `regions.py`): base draws; wide draws from N(0, s^2 I), with s as
-       large as the levels went deep; subset simulation from the base draws and, in the same batches, lines of descent,
-       points that walk downhill each alone; chains inside the failure region from all of these. Two failing points are
-       of one region if the point half way between them fails.
-    2. *Refinement* (`refinement.py`): each region is described by Gaussians, by a hyperplane from
-       linear regression of f where f is linear, by a corner of several where f is the greatest of linear functions,
-       and by a radius.
-       Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
-       a tenth of a failure. The weights minimise the estimated variance (`mixture.py`), with lower limits for
-       the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and
-       for each region.
+    1. *Exploration* (`exploration.py`, `regions.py`): base draws; wide draws from N(0, s^2 I); subset simulation from
+       the base draws and, in the same batches, lines of descent, points that walk downhill each alone; chains inside
+       the failure region from all of these. Two failing points are of one region if the point half way between them
+       fails.
+    2. *Refinement* (`refinement.py`): each region is described by Gaussians, by a hyperplane from linear regression of
+       f where f is linear, by a corner of several where f is the greatest of linear functions, and by a radius.
+       Three rounds of draws follow, each from a mixture of these, and up to two more while the draws of some region
+       have very uneven weights. The weights of the mixture minimise the estimated variance (`mixture.py`), with lower
+       limits for the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad
+       description) and for each region.
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, together with those of
        the rounds from the third on, each weighted as a draw of its own mixture.
 
@@ -71,9 +69,9 @@ class TwoStage(Method):
     simulation and lines of descent use its values, everything else only its sign.
 
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
-    is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not
-    separated, and half of the draws come from tempered Gaussians. Coordinates of x that the base distribution calls
-    noise are not searched (`methods/searched.py`).
+    is simulated again. A noisy f is recognised by points right beside failing ones, where the chains end and beside
+    the failures that weigh most after the first round. Regions are then not separated, and half of the draws come from
+    tempered Gaussians. Coordinates of x that the base distribution calls noise are not searched (`methods/base.py`).
 
     *Interval* (`regions.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
     bound where very few do. The upper end is at least Hall's, which knows the skewness of the weights, and holds the
@@ -86,16 +84,15 @@ class TwoStage(Method):
     1 - M. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25, 0.005 for 200. The c.o.v. is that of the sampling
     alone.
 
-    *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p allows, rounds that
-    contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
-    exceed 0.3. A region that neither f announces nor any draw has hit gives no warning; `Estimate.unseen` bounds it.
-
-    *Terms.* Where they are offered, a term of which no state of the chains fails is searched alone (`terms_alone.py`);
-    a remark names those that did not reach failure.
+    *Warnings* (`stratified.py`): uneven weights, all in all and in a region, base draws that fail more often than p
+    allows, rounds that contradict the estimate, regions that the last draws hardly reach, and a search of so few
+    lineages that M may exceed 0.3. A region that neither f announces nor any draw has hit gives no warning;
+    `Estimate.unseen` bounds it.
 
     *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
     Carlo), and where no mixture describes the failures (adaptive subset simulation in all coordinates): dozens of
-    regions, hundreds of dimensions without a direction that matters, failures that noise alone decides on.
+    regions in many dimensions without a direction that matters, before the first round; after a round, where its draws
+    are worth too little.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches of a tenth of it
@@ -126,21 +123,19 @@ class TwoStage(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_settings(self, n=TWO_STAGE.min_exploration_budget)
+        check_settings(self, n=BUDGET.least)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
         return run_two_stage(inputs, goal, self.n if goal.max_sim is None else goal.max_sim, rng)
 
 
-def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
-    """Estimate P[f(X) <= goal.gamma] with a budget that need not be the goal's."""
-    offer = offer_of(inputs)
-    record = TermRecord() if offer is not None and offer.with_f else None
-    outcome = yield from _explore_and_estimate(inputs, goal, budget, rng, record)
-    return outcome if record is None else replace(outcome, remarks=(*outcome.remarks, *record.describe(outcome.p)))
-
-
+TARGET_BATCHES, MOST_BATCHES = 10, 100
+"""With a target c.o.v. the budget over the first is a batch of the estimate; the second is the most of them."""
+NOISE_PROBES = 20
+"""Failures that weigh most beside which noise is looked for."""
+LEAST_FALLBACK = 300
+"""Simulations under which subset simulation is not worth it."""
 SearchRun = RunContext[Simulator]
 
 
@@ -158,6 +153,8 @@ class RunState:
     """Base draws in all: of a proposal those of its first component."""
     rounds: tuple[Draws, ...] = ()
     """Draws of the rounds, each weighted as draws of its own proposal."""
+    last_u: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """The failing ones of the last round, shape (k, d)."""
     counted: tuple[tuple[StratifiedSample, int], ...] = ()
     """Those of the rounds that count in p, and the simulations before them."""
 
@@ -166,32 +163,26 @@ class RunState:
         return float((self.base_f <= gamma).mean())
 
 
-def _explore_and_estimate(
-    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, record: TermRecord | None
-) -> Steps:
-    """Run all stages; `record` takes the terms of what the exploration simulates."""
+def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
+    """Estimate P[f(X) <= goal.gamma] with a budget that need not be the goal's."""
     open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + TWO_STAGE.max_batches * (budget // TWO_STAGE.target_batches) if open_ended else budget
+    end = budget + MOST_BATCHES * (budget // TARGET_BATCHES) if open_ended else budget
     searched = marginalise_noise(inputs, rng)  # noise that is part of x is left to chance
     run = RunContext(inputs, Simulator(searched, goal), goal, budget, end, rng)
     nothing = np.empty((0, searched.dim))
     state = RunState(history=MultipleImportanceSample.empty(searched.dim), base_u=nothing, base_f=np.empty(0))
-    if budget < TWO_STAGE.min_exploration_budget:
-        least = TWO_STAGE.min_exploration_budget
-        about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
+    if budget < BUDGET.least:
+        about = f"max_sim leaves {budget} simulations, too few for an exploration ({BUDGET.least}): base draws only."
         return (yield from _run_monte_carlo(run, state)).remark_first(about)
     try:
-        first = _draw_first(run, state)
-        state = yield from (first if record is None else record.watch(first))
-        if state.base_share(goal.gamma) >= TWO_STAGE.common_share:
+        state = yield from _draw_first(run, state)
+        if state.base_share(goal.gamma) >= BUDGET.common_share:
             return (yield from _run_monte_carlo(run, state, counted=False))
-        search = _explore(run, state)
-        exploration = yield from (search if record is None else record.watch(search))
-        if record is not None:
-            drawn = state.history.batches[0]
-            exploration = yield from explore_terms(run.simulator, exploration, record, drawn, goal.gamma, run.left, rng)
+        exploration = yield from _explore(run, state)
         if not exploration.regions:
             return (yield from _run_monte_carlo(run, state))
+        if exploration.is_shell and run.left_at_all >= LEAST_FALLBACK:
+            return (yield from _fall_back(run, state, exploration.levels))
         refinement = start_refinement(exploration, goal.gamma, rng)
         proposal = build_proposal(refinement, state.history)
         room, number, final = run.left, 0, False
@@ -204,11 +195,10 @@ def _explore_and_estimate(
     except Interrupted:
         return _estimate_early(run, state)
     outcome = yield from _estimate(run, state, refinement, proposal)
-    if budget >= TWO_STAGE.sufficient_budget:
+    if budget >= BUDGET.sufficient:
         return outcome
-    enough = TWO_STAGE.sufficient_budget
-    about = f"A search of only {budget:,} simulations may miss failure regions ({enough:,} are recommended)."
-    return replace(outcome, warnings=(*outcome.warnings, about))
+    about = f"A search of {budget:,} simulations misses one of two like regions in up to 30 % of runs"
+    return outcome.remark_first(f"{about}; {BUDGET.sufficient:,} are recommended.")
 
 
 def _draw_first(run: SearchRun, state: RunState) -> SimulationSteps[RunState]:
@@ -247,16 +237,14 @@ def _refine(
     proposal: MixtureProposal,
 ) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
     """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
-    shares = (*REFINEMENT.round_shares, *REFINEMENT.further_shares)
+    shares = (*PROPOSAL.round_shares, *PROPOSAL.further_shares)
     n = int(shares[number - 1] * room)
     if n > 0:
         state, refinement = yield from _draw_round(run, state, refinement, proposal, n)
-    enough = (
-        refinement.exploration.noisy
-        or not state.rounds
-        or state.rounds[-1].ess >= REFINEMENT.good_rate * state.rounds[-1].n
-    )
-    final = number == len(shares) or (enough and number >= len(REFINEMENT.round_shares))
+    if number == 1 and n > 0 and not refinement.exploration.noisy:
+        refinement = yield from _look_for_noise(run, state, refinement)
+    described = not state.rounds or not badly_described(refinement, state.last_u, state.rounds[-1].log_weights)
+    final = number == len(shares) or (described and number >= len(PROPOSAL.round_shares))
     return state, refinement, build_proposal(refinement, state.history, final=final), final
 
 
@@ -266,8 +254,9 @@ def _draw_round(
     """Draw n points from a proposal and learn from them."""
     state, batch = yield from _draw(run, state, proposal, n)
     gamma = run.goal.gamma
-    common = np.count_nonzero(state.base_f <= gamma) >= EXPLORATION.common_failures  # these draws do not count in p
-    if len(state.rounds) >= REFINEMENT.counted_from - int(common):
+    # The proposals of the first two rounds may not describe the failures; base draws that fail do not count in p.
+    common = np.count_nonzero(state.base_f <= gamma) >= EXPLORATION.common_failures
+    if len(state.rounds) >= 2 - int(common):
         inputs = run.simulator.inputs
         empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0))
         counted = empty.add(batch, proposal, inputs, gamma), batch.first
@@ -278,7 +267,20 @@ def _draw_round(
     ess = effective_sample_size(history.log_weights)
     p = float(np.exp(history.log_weights).sum())
     _record_draws(run, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess)
-    return replace(state, history=history, rounds=(*state.rounds, draws)), refinement
+    last_u = batch.u[batch.f <= gamma]
+    return replace(state, history=history, rounds=(*state.rounds, draws), last_u=last_u), refinement
+
+
+def _look_for_noise(run: SearchRun, state: RunState, refinement: RefinementState) -> SimulationSteps[RefinementState]:
+    """Look for noise beside the failures that weigh most; with noise, begin anew with all regions as one.
+
+    Noise matters where failures are likely, near the origin; chains may be deep inside the failure region.
+    """
+    heaviest = np.argsort(-state.history.log_weights, kind="stable")[:NOISE_PROBES]
+    if len(heaviest) < NOISE_PROBES:
+        return refinement
+    noisy = yield from is_noisy(run.simulator, state.history.u[heaviest], run.goal.gamma, run.rng)
+    return start_refinement(refinement.exploration.as_noisy(), run.goal.gamma, run.rng) if noisy else refinement
 
 
 def _gives_up(
@@ -294,20 +296,21 @@ def _gives_up(
 
     It does where the draws meet too few failures, or where the proposal is far from most of the regions found.
     """
-    if run.left_at_all < FALLBACK.min_fallback_budget or not state.rounds:
+    if run.left_at_all < LEAST_FALLBACK or not state.rounds:
         return False
     if refinement.exploration.noisy and not (final and run.simulator.inputs is not run.inputs):
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
     last, early = state.rounds[-1], FALLBACK.early_rates
-    late = FALLBACK.relative_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
+    late = FALLBACK.late_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
     rate = early[number - 1] if number <= len(early) else late
-    if last.ess < (FALLBACK.sloped_rate if refinement.within is not None else 1.0) * rate * last.n:
+    # Draws within the span of slopes leave few places out: the weights met are about as uneven as all of them.
+    if last.ess < (0.25 if refinement.within is not None else 1.0) * rate * last.n:
         return True
-    described = (
-        refinement.exploration.noisy or refinement.within is not None
-    )  # ends of lines in a ring are no typical failures
-    doubtful = final and not described and last.ess < REFINEMENT.good_rate * last.n
-    return doubtful and float(np.median(typical_weights(refinement, proposal))) > FALLBACK.max_typical * last.p
+    # Ends of lines in a ring are no typical failures.
+    described = refinement.exploration.noisy or refinement.within is not None
+    doubtful = final and not described and last.ess < PROPOSAL.good_rate * last.n
+    typical = typical_weights(refinement, proposal, state.history)
+    return doubtful and float(np.median(typical)) > FALLBACK.max_typical * last.p
 
 
 def _fall_back(run: SearchRun, state: RunState, levels: int) -> Steps:
@@ -347,9 +350,9 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
     p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
     """
     goal, inputs, stopped = run.goal, run.simulator.inputs, False
-    typical = typical_weights(refinement, proposal)
+    typical = typical_weights(refinement, proposal, state.history)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
-    whole = sample
+    whole, failing = sample, list[FloatArray]()
     size = run.left if goal.target_cov is None else _target_batch(run)
     while run.left_at_all > 0:
         try:
@@ -358,6 +361,7 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
+        failing.append(batch.u[batch.f <= goal.gamma])
         whole = reduce(StratifiedSample.join, (each for each, _ in state.counted), sample)
         _record_draws(run, batch, whole.p, whole.cov, whole.draws.ess)
         if run.meets_target(whole.cov):
@@ -374,9 +378,8 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
     doubts = [
         *check_base_draws(whole.p, hits, len(state.base_f)),
         *check_rounds(sample, state.rounds),
-        *check_regions(whole),
+        *check_regions(whole, badly_described(refinement, np.concatenate(failing), sample.draws.log_weights)),
         *check_discovery(whole.p, discovery, goal.confidence),
-        *([] if refinement.exploration.noisy else check_efficiency(sample)),
     ]
     return replace(
         outcome,
@@ -402,7 +405,7 @@ def _run_monte_carlo(run: SearchRun, state: RunState, *, counted: bool = True) -
     """Spend the rest on base draws."""
     goal, inputs, stopped, first = run.goal, run.simulator.inputs, False, run.simulator.n_sim
     u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
-    size = TWO_STAGE.monte_carlo_batch if goal.target_cov is None else _target_batch(run)
+    size = 10_000 if goal.target_cov is None else _target_batch(run)
     while run.left_at_all > 0:
         new_u = run.rng.standard_normal((min(run.left_at_all, size), inputs.dim))
         try:
@@ -444,7 +447,7 @@ def _draw(
 
 def _target_batch(run: SearchRun) -> int:
     """Return the draws after which a target c.o.v. is looked at."""
-    return max(run.budget // TWO_STAGE.target_batches, TWO_STAGE.min_target_batch)
+    return max(run.budget // TARGET_BATCHES, 100)
 
 
 def _record_draws(run: SearchRun, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:

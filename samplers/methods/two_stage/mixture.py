@@ -33,17 +33,14 @@ from samplers.components import (
     start_from_centres,
 )
 from samplers.methods.two_stage.edges import weighted_quantile
-from samplers.methods.two_stage.settings import EDGES, SUBSPACE
+from samplers.methods.two_stage.settings import FIT, HIGH_DIM
 from samplers.problem import FloatArray
 from samplers.sample import normalise_weights
 
-Kind = Literal[
-    "base", "wide", "radial", "gaussian", "linear", "corner", "explored", "tempered", "spread", "directional"
-]
+Kind = Literal["base", "radial", "gaussian", "linear", "corner", "explored", "tempered", "spread", "directional"]
 """Where a component of a proposal comes from:
 
     base        N(0, I), which bounds all weights
-    wide        N(0, s^2 I)
     directional a direction and a radius, for failures like a shell or a cone
     radial      every direction alike, from the radius of the failures on
     gaussian    fitted to weighted failures
@@ -160,10 +157,10 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
     norm = float(np.linalg.norm(mean))
     v = mean / norm if norm > 0 else np.eye(dim)[0]
     along = float(weights @ (u @ v - norm) ** 2)
-    if dim > SUBSPACE.high_dim:
+    if dim > HIGH_DIM:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
-        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), SUBSPACE.max_mean_excess)
-        variance = np.array([min(along * (1 - excess) + excess, SUBSPACE.max_spread)])
+        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), 0.5)
+        variance = np.array([min(along * (1 - excess) + excess, 4.0)])
         raised = inflate_variances(variance, ess)
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
     centred = (u - mean) * np.sqrt(weights)[:, None]  # E[u u'] less squares loses digits far out
@@ -178,8 +175,8 @@ def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
     Too small a variance makes weights unbounded, too large a one costs a few draws.
     """
     variance = np.maximum(variance, LEAST_VARIANCE_OF_COMPONENT)
-    error = math.sqrt(2 / max(ess, SUBSPACE.min_ess))
-    raised = np.minimum(variance * (1 + SUBSPACE.standard_errors * error), 1.0)
+    error = math.sqrt(2 / max(ess, 2.0))
+    raised = np.minimum(variance * (1 + FIT.standard_errors * error), 1.0)
     return np.where(variance < 1, raised, variance)
 
 
@@ -187,10 +184,10 @@ def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Genera
     """Return a mixture of at most `most` components, their number chosen by BIC."""
     best = None
     worse = 0
-    for k in (size for size in SUBSPACE.sizes if size <= most):
-        if k > 1 and (k > points.n_groups or points.ess < SUBSPACE.points_per_component * k):
+    for k in (size for size in FIT.sizes if size <= most):
+        if k > 1 and (k > points.n_groups or points.ess < 4.0 * k):
             break
-        restarts = 1 if k == 1 else SUBSPACE.em_restarts
+        restarts = 1 if k == 1 else 3
         found = max(
             (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
             key=lambda mix: mix.score,
@@ -199,7 +196,7 @@ def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Genera
             best, worse = found, 0
         else:
             worse += 1
-        if worse == SUBSPACE.max_worse:
+        if worse == 2:
             break
     assert best is not None  # one component can always be fitted
     return best
@@ -233,7 +230,7 @@ def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
         mass = (responsibilities * weights).sum(axis=1)
         shares, mass = responsibilities[mass * ess > 1], mass[mass * ess > 1]
         fits = [
-            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, SUBSPACE.min_ess))
+            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, 2.0))
             for share, m in zip(shares, mass, strict=True)
         ]
         return _Fitted([one for one, _ in fits], [share for _, share in fits], mass / mass.sum())
@@ -250,14 +247,14 @@ def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
         log_terms,
         start,
         once_per_group,
-        SUBSPACE.max_em_iterations,
-        lambda total: SUBSPACE.min_relative_gain * abs(total),
+        25,
+        lambda total: 1e-3 * abs(total),
     )
     dim = points.u.shape[1]
-    most = SUBSPACE.covariance_parameters_per_dim * dim
+    most = 2.0 * dim
     covariances = [min((1 - share) * dim * (dim + 1) / 2, most) for share in fit.target_shares]
     parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
-    penalty = 0.5 * math.log(max(points.ess, SUBSPACE.min_bic_ess)) * parameters
+    penalty = 0.5 * math.log(max(points.ess, 3.0)) * parameters
     return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
 
 
@@ -271,7 +268,7 @@ def refit_components(
     """
     weights = truncate_weights(log_weights)
     log_mixing = np.zeros(len(components))
-    for _ in range(SUBSPACE.refit_steps):
+    for _ in range(2):
         shares = posterior(log_ratios(components, u) + log_mixing[:, None])
         log_w = np.log(np.maximum(weights, TINY_WEIGHT))
         components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
@@ -285,17 +282,17 @@ def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_w
     Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
     """
     count = float(shares.sum())
-    if count < SUBSPACE.min_refit_points:
+    if count < 5:
         return component
-    wanted = max(SUBSPACE.refit_ess, SUBSPACE.refit_ess_per_dim * u.shape[1])
-    wanted = min(wanted, count / SUBSPACE.points_per_refit_ess)
+    wanted = max(FIT.ess[0], FIT.ess[1] * u.shape[1])
+    wanted = min(wanted, count / 3.0)
     log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
-    for power in np.arange(1.0, 0.0, -SUBSPACE.power_step):
+    for power in np.arange(1.0, 0.0, -0.1):
         w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
             break
-    return fit_shrunk_subspace_gaussian(u, w, max(ess, SUBSPACE.min_ess))[0]
+    return fit_shrunk_subspace_gaussian(u, w, max(ess, 2.0))[0]
 
 
 def truncate_weights(log_weights: FloatArray) -> FloatArray:
@@ -318,12 +315,12 @@ def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     of what |u|^2 exceeds the start by.
     """
     square = np.einsum("ij,ij->i", u, u)
-    start = EDGES.radius_factor * weighted_quantile(square, weights, EDGES.radius_share)
+    start = 0.98 * weighted_quantile(square, weights, 0.01)
     outside = square > start
     excess, w = square[outside] - start, weights[outside]
     mean = float(np.average(excess, weights=w))
     variance = max(float(np.average((excess - mean) ** 2, weights=w)), MIN_VARIANCE)
-    shape = max(mean * mean / variance, EDGES.min_radial_shape)
+    shape = max(mean * mean / variance, 0.3)
     return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))
 
 

@@ -5,10 +5,12 @@ proposal for the next round follows from the state (`candidates.build_proposal`)
 (`MultipleImportanceSample`).
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.components import (
@@ -20,7 +22,12 @@ from samplers.components import (
     log_ratios,
 )
 from samplers.methods.base import ComponentDraws
-from samplers.methods.two_stage.edges import half_space_proposals, intersection_of_half_spaces, union_of_half_spaces
+from samplers.methods.two_stage.edges import (
+    half_space_proposals,
+    intersection_of_half_spaces,
+    union_of_half_spaces,
+    weighted_quantile,
+)
 from samplers.methods.two_stage.mixture import (
     NO_REGION,
     Floor,
@@ -35,16 +42,17 @@ from samplers.methods.two_stage.mixture import (
     truncate_weights,
 )
 from samplers.methods.two_stage.regions import ExplorationResult, Region
-from samplers.methods.two_stage.settings import INITIAL_SHARES, REFINEMENT, SUBSPACE
+from samplers.methods.two_stage.settings import HIGH_DIM, PROPOSAL
 from samplers.methods.two_stage.stratified import MultipleImportanceSample
 from samplers.problem import FloatArray
 from samplers.sample import effective_sample_size
 
-SHARP_KINDS = ("gaussian", "linear", "corner", "explored", "radial")
-"""Components that are meant to hold failures only."""
 TYPICAL_QUANTILE = 0.75
 """Of the mean weights of chains: that of the heaviest may be where hardly any failure is."""
-DISTANT_KINDS = ("base", "wide", "radial")
+PROBIT_SCALE = 1.702
+"""Log odds over the argument of Phi that is next to them: noise is near normal, and the logistic curve has far heavier
+tails (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)."""
+DISTANT_KINDS = ("base", "radial")
 """Components whose draws are not near any region."""
 
 
@@ -82,8 +90,6 @@ class RefinementState:
     linear: tuple[ProposalComponent, ...]
     """Half-spaces and corners from linear regression of f around each region, and of its pieces in the slopes' span."""
     rounds: tuple[NearDraws, ...] = ()
-    hit_rate: float = 1.0
-    """Share of the last round's draws from SHARP_KINDS that failed."""
     within: "RefinementState | None" = None
     """The same in the coordinates of the slopes, where the exploration has found some."""
 
@@ -115,11 +121,11 @@ def start_refinement(exploration: ExplorationResult, gamma: float, rng: np.rando
 
 def _describe_regions(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> RefinementState:
     """Return the initial state in the coordinates of the exploration."""
-    most = REFINEMENT.noisy_gaussians if exploration.noisy else REFINEMENT.gaussians_per_region
+    most = 8 if exploration.noisy else 3  # a region has some dozens of points; with noise all of it is one region
     explored = tuple(
         ProposalComponent(gaussian, "explored", k)
         for k, region in enumerate(exploration.regions)
-        for gaussian in _fit_chains(region, most, REFINEMENT.points_per_chain, rng)
+        for gaussian in _fit_chains(region, most, rng)
     )
     linear = tuple(
         proposal
@@ -139,27 +145,24 @@ def refine_once(
 ) -> RefinementState:
     """Return the state after a round of draws."""
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
-    sharp, near = np.isin(kinds, SHARP_KINDS), ~np.isin(kinds, DISTANT_KINDS)
+    near = ~np.isin(kinds, DISTANT_KINDS)
     u = batch.u[near]
-    draws = NearDraws(u, batch.f[near], proposal.log_weights(u))
-    hit_rate = float((batch.f[sharp] <= state.gamma).mean()) if sharp.any() else 0.0
-    return _learn(state, history, draws, hit_rate, rng)
+    return _learn(state, history, NearDraws(u, batch.f[near], proposal.log_weights(u)), rng)
 
 
 def _learn(
     state: RefinementState,
     history: MultipleImportanceSample,
     draws: NearDraws,
-    hit_rate: float,
     rng: np.random.Generator,
 ) -> RefinementState:
     """Return the state, and that in the coordinates of the slopes, moved to the failures of `history`."""
     axes, within = state.exploration.slopes, state.within
     if axes is not None and within is not None:
-        within = _learn(within, history.within(axes), draws.within(axes), hit_rate, rng)
+        within = _learn(within, history.within(axes), draws.within(axes), rng)
         within = _add_pieces(within, rng)
-    state = replace(state, rounds=(*state.rounds, draws), hit_rate=hit_rate, within=within)
-    if len(history.u) < REFINEMENT.min_refit_failures:
+    state = replace(state, rounds=(*state.rounds, draws), within=within)
+    if len(history.u) < 6:  # too few to move anything
         return state
     return replace(
         state, gaussians=refit_components(state.gaussians, history.u, history.log_weights), linear=_fit_linear(state)
@@ -175,39 +178,64 @@ def _add_pieces(state: RefinementState, rng: np.random.Generator) -> RefinementS
     return replace(state, linear=others if union is None else (*others, ProposalComponent(union, "linear")))
 
 
-def typical_weights(state: RefinementState, proposal: MixtureProposal) -> FloatArray:
+def typical_weights(state: RefinementState, proposal: MixtureProposal, history: MultipleImportanceSample) -> FloatArray:
     """Return the weight that a typical point of each region would have as a draw of a proposal, shape (m,).
 
-    The upper quartile over the chains of the mean over the second half of their states: starts are far from where
-    failures are likely, and a few chains may still be.
+    The upper quartile over the chains of the mean over their likely states: those whose |u|^2 is within the weighted
+    99 % quantile of the failures that the rounds have met. Chains start far from where failures are likely, and a few
+    may still be; 0 where a region has no likely state.
     """
+    limit = math.inf
+    if len(history.u):
+        weights = np.exp(history.log_weights - history.log_weights.max())
+        limit = weighted_quantile((history.u**2).sum(axis=1), weights, 0.99)
     typical = []
     for region in state.regions:
-        late = region.chains[:, region.chains.shape[1] // 2 :]
-        weights = np.exp(proposal.log_weights(late.reshape(-1, state.dim))).reshape(late.shape[:2])
-        typical.append(float(np.quantile(weights.mean(axis=1), TYPICAL_QUANTILE)))
+        chains, steps = region.chains.shape[:2]
+        likely = (region.chains**2).sum(axis=2) <= limit
+        weights = np.exp(proposal.log_weights(region.points)).reshape(chains, steps) * likely
+        means = weights.sum(axis=1)[likely.any(axis=1)] / likely.sum(axis=1)[likely.any(axis=1)]
+        typical.append(float(np.quantile(means, TYPICAL_QUANTILE)) if len(means) else 0.0)
     return np.array(typical)
 
 
-def _fit_chains(region: Region, most: int, points_per_chain: float, rng: np.random.Generator) -> list[SubspaceGaussian]:
+def nearest_regions(state: RefinementState, u: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the region of each point u (n, d), that of the densest Gaussian of the exploration, and log(q / phi)."""
+    log_r = log_ratios([candidate.component for candidate in state.explored], u)
+    regions = np.array([candidate.region for candidate in state.explored])
+    return regions[log_r.argmax(axis=0)], log_r.max(axis=0)
+
+
+def badly_described(state: RefinementState, u: FloatArray, log_weights: FloatArray) -> int:
+    """Return the number of regions whose failing draws u (n, d) have weights too uneven to tell what it adds to p.
+
+    Another region may be described so well that the draws are worth enough all in all.
+    """
+    if len(u) == 0 or state.exploration.noisy:
+        return 0
+    nearest, _ = nearest_regions(state, u)
+    weights = [log_weights[nearest == k] for k in range(len(state.regions))]
+    return sum(len(own) >= 10 and effective_sample_size(own) < PROPOSAL.described * len(own) for own in weights)
+
+
+def _fit_chains(region: Region, most: int, rng: np.random.Generator) -> list[SubspaceGaussian]:
     """Return at most `most` Gaussians fitted to the chains of a region; a chain belongs to one of them."""
     chains, steps, dim = region.chains.shape
     n = chains * steps
     points = GroupedPoints(
         u=region.points,
         weights=np.full(n, 1 / n),
-        ess=points_per_chain * chains,
+        ess=2.0 * chains,  # a chain is worth two independent points
         groups=np.repeat(np.arange(chains), steps),
     )
-    return fit_subspace_mixture(points, most if dim <= SUBSPACE.high_dim else 1, rng).components
+    return fit_subspace_mixture(points, most if dim <= HIGH_DIM else 1, rng).components
 
 
 def _fit_linear(state: RefinementState) -> tuple[ProposalComponent, ...]:
     """Return half-space proposals from what was known of each region and the draws nearest to it."""
     u, f = np.concatenate([draws.u for draws in state.rounds]), np.concatenate([draws.f for draws in state.rounds])
-    log_r = log_ratios([candidate.component for candidate in state.explored], u)
-    nearest = np.array([candidate.region for candidate in state.explored])[log_r.argmax(axis=0)]
-    owner = np.where(log_r.max(axis=0) > REFINEMENT.min_log_ratio, nearest, NO_REGION)
+    owner, log_r = nearest_regions(state, u)
+    owner = np.where(log_r > 1.0, owner, NO_REGION)  # the densest Gaussian of its own is e times phi or more
     fails = f <= state.gamma
     proposals: list[ProposalComponent] = []
     for k, region in enumerate(state.regions):
@@ -238,11 +266,11 @@ def build_proposal(
     """
     candidates = list_candidates(state, history)
     kinds = np.array([candidate.kind for candidate in candidates])
-    start = np.array([INITIAL_SHARES[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
+    start = np.array([PROPOSAL.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
-    floors = _set_floors(state, history, candidates, radial=state.dim <= REFINEMENT.radial_dim, final=final)
+    floors = _set_floors(state, history, candidates, radial=state.dim <= PROPOSAL.radial_dim, final=final)
     u, log_w = history.u, history.log_weights
     if state.exploration.noisy:
         u, log_w = _smooth_indicators(history, state.gamma)
@@ -251,9 +279,9 @@ def build_proposal(
     keeps = kinds == "base"
     if not final:
         explored = np.isin(kinds, ["explored", "linear", "corner", "spread"])
-        weights = np.where(explored, np.maximum(weights, REFINEMENT.explored_share), weights)
+        weights = np.where(explored, np.maximum(weights, 0.01), weights)  # kept until the last round
         keeps = keeps | explored
-    weights = np.where((weights < REFINEMENT.min_share) & ~keeps, 0.0, weights)
+    weights = np.where((weights < 0.004) & ~keeps, 0.0, weights)
     return MixtureProposal(candidates, FloorIndex.of(floors, len(weights)).apply(weights / weights.sum()))
 
 
@@ -274,14 +302,13 @@ def list_candidates(state: RefinementState, history: MultipleImportanceSample) -
         directional = [ProposalComponent(law, "directional")]
     candidates = [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
-        ProposalComponent(IsotropicNormal(state.dim, REFINEMENT.wide_scale), "wide"),
         *_fit_radial_components(state, history),
         *regional,
         *directional,
-        *_temper_gaussians(regional, REFINEMENT.noisy_tempering if state.exploration.noisy else REFINEMENT.tempering),
+        *_temper_gaussians(regional, (0.5, 0.25) if state.exploration.noisy else (0.5,)),
     ]
     candidates += _lift_candidates(state, history)
-    return [candidate for candidate in candidates if candidate.kind in INITIAL_SHARES]
+    return candidates
 
 
 def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
@@ -290,7 +317,7 @@ def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) 
     if state.within is None or axes is None:
         return []
     failures = history.within(axes)
-    inside = [c for c in list_candidates(state.within, failures) if c.kind not in ("base", "wide")]
+    inside = [c for c in list_candidates(state.within, failures) if c.kind != "base"]
     u, weights = _weighted_failures(state.within, failures)
     values, across = np.linalg.eigh((u * weights[:, None]).T @ u)  # as wide as the failures, at least N(0, I)
     spread = SubspaceGaussian(across, np.zeros(len(values)), np.maximum(values, 1.0))
@@ -313,7 +340,7 @@ def _fit_radial_components(state: RefinementState, history: MultipleImportanceSa
     if state.dim < 2:
         return []
     radial = [fit_radial(state.points, np.ones(len(state.points)))]
-    if len(history.u) >= REFINEMENT.min_radial_failures:
+    if len(history.u) >= 20:
         log_w = history.log_weights
         radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
     return [ProposalComponent(component, "radial") for component in radial]
@@ -352,22 +379,20 @@ def _set_floors(
     """
     kinds = np.array([candidate.kind for candidate in candidates])
     regions = np.array([candidate.region for candidate in candidates])
-    spread = state.exploration.scattered and state.within is not None
-    extra = 0.0 if spread else REFINEMENT.extra_tempered_share * (1 - state.hit_rate)
-    tempered = REFINEMENT.noisy_tempered_share if state.exploration.noisy else REFINEMENT.tempered_share + extra
-    n = len(state.regions)
+    noisy, n = state.exploration.noisy, len(state.regions)
+    tempered = PROPOSAL.tempered_share[noisy]
     floors = [Floor(kinds == "tempered", tempered)]
     if n > 1 and not state.exploration.scattered:
         shares = _share_among_regions(state, history)
         floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
-    if state.exploration.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < REFINEMENT.good_rate):
-        floors.append(Floor(kinds == "spread", REFINEMENT.spread_share))
-    if state.exploration.scattered or (radial and not state.exploration.noisy):
-        floors.append(Floor(kinds == "radial", REFINEMENT.radial_share))
+    if state.exploration.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < PROPOSAL.good_rate):
+        floors.append(Floor(kinds == "spread", PROPOSAL.spread_share))
+    if state.exploration.scattered or (radial and not noisy):
+        floors.append(Floor(kinds == "radial", PROPOSAL.radial_share))
     if n > 1 and not state.exploration.scattered:
-        share = REFINEMENT.final_region_share if final else REFINEMENT.region_share
+        share = PROPOSAL.region_share[final]
         floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
-    base = REFINEMENT.noisy_base_share if state.exploration.noisy else REFINEMENT.base_share
+    base = PROPOSAL.base_share[noisy]
     floors = [floor for floor in floors if floor.members.any()]
     fit = min(1.0, (1 - base) / max(sum(floor.least for floor in floors), base))
     floors = [floor._replace(least=fit * floor.least) for floor in floors]
@@ -384,8 +409,8 @@ def _smooth_indicators(history: MultipleImportanceSample, gamma: float) -> tuple
     from sklearn.preprocessing import PolynomialFeatures
 
     u, f, log_w = history.all_draws()
-    degree = 2 if u.shape[1] <= REFINEMENT.quadratic_dim else 1
+    degree = 2 if u.shape[1] <= 20 else 1  # 231 coefficients at most
     x = PolynomialFeatures(degree, include_bias=False).fit_transform(u)
-    model = LogisticRegression(C=REFINEMENT.logistic_penalty, max_iter=REFINEMENT.logistic_iterations, random_state=0)
-    odds = model.fit(x, f <= gamma).decision_function(x) / REFINEMENT.probit_scale
+    model = LogisticRegression(C=100.0, max_iter=2000, random_state=0)  # hardly any penalty
+    odds = model.fit(x, f <= gamma).decision_function(x) / PROBIT_SCALE
     return u, log_w + log_ndtr(odds)

@@ -13,8 +13,7 @@ from scipy.special import betaincinv
 
 from samplers.importance import Draws, weighted_interval
 from samplers.methods.base import SimulationSteps, Simulator
-from samplers.methods.two_stage.edges import fit_hyperplane
-from samplers.methods.two_stage.settings import REGIONS, SUBSPACE
+from samplers.methods.two_stage.settings import HIGH_DIM, REGIONS
 from samplers.problem import FloatArray
 from samplers.sample import PRIOR_SHARE, Interval, add_unseen, effective_sample_size, skewed_upper_end
 
@@ -80,32 +79,6 @@ class Region(NamedTuple):
         return Region(self.chains @ axes, self.u @ axes, self.f)
 
 
-class ChainPaths(NamedTuple):
-    """States of chains and what was proposed to them."""
-
-    states: FloatArray
-    """Shape (chains, steps, d)."""
-    proposals: FloatArray
-    """Shape (chains, steps, d)."""
-    f: FloatArray
-    """Outcomes of the proposals, shape (chains, steps)."""
-    sigma: FloatArray
-    """Adapted pCN steps, shape (chains,)."""
-
-    @property
-    def ends(self) -> FloatArray:
-        """Last states, shape (chains, d)."""
-        return self.states[:, -1]
-
-    def select(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "ChainPaths":
-        """Return some of the chains."""
-        return ChainPaths(*(part[which] for part in self))
-
-    def to_region(self) -> Region:
-        """Return the region that these chains are in."""
-        return Region(self.states, self.proposals.reshape(-1, self.states.shape[2]), self.f.ravel())
-
-
 class SubsetPoints(NamedTuple):
     """Points of subset simulation."""
 
@@ -138,104 +111,80 @@ class ExplorationResult(NamedTuple):
     slopes: FloatArray | None = None
     """Orthonormal directions in which f changes at failing points, shape (d, r); None where they are not sought."""
 
+    @property
+    def is_shell(self) -> bool:
+        """Whether no proposal is to be expected: pieces of a shell or a ring, and no few directions that matter."""
+        return self.scattered and self.slopes is None and self.regions[0].u.shape[1] > HIGH_DIM
+
+    def as_noisy(self) -> "ExplorationResult":
+        """Return the same with all regions as one."""
+        whole = Region(*(np.concatenate(parts) for parts in zip(*self.regions, strict=True)))
+        return self._replace(regions=[whole], noisy=True, scattered=False, slopes=None)
+
     def within(self, axes: FloatArray) -> "ExplorationResult":
         """Return the same in the coordinates of orthonormal axes (d, r)."""
         return self._replace(regions=[region.within(axes) for region in self.regions], slopes=None)
 
 
 def grow_regions(
-    simulator: Simulator, starts: FloatArray, descent: SubsetPoints, gamma: float, limit: int, rng: np.random.Generator
+    simulator: Simulator, starts: FloatArray, gamma: float, limit: int, rng: np.random.Generator
 ) -> SimulationSteps[ExplorationResult]:
-    """Run chains from failing points, twice; sort them into regions after each time.
+    """Run chains from failing points (n, d) to likely ones, and sort them into regions by where they end.
 
-    The first chains come from wide failures to likely ones. The second start where these ended, follow the direction
-    of their region, and are more for regions that have few. Beyond `limit` simulations points are no longer compared.
+    The last steps describe a region: its states, and what was proposed, failing or not. Beyond `limit` simulations
+    points are no longer compared. With a noisy f regions cannot be separated, and all of it is one.
     """
-    dim = starts.shape[1]
-    high_dim = dim > SUBSPACE.high_dim
-    steps = REGIONS.steps_high_dim if high_dim else REGIONS.steps
-    sigma = np.full(len(starts), REGIONS.initial_step)
-    first = yield from _pcn_chains(simulator, starts, sigma, None, steps[0], gamma, rng)
-    if (yield from _is_noisy(simulator, first.ends, gamma, rng)):
-        last = yield from _pcn_chains(simulator, first.ends, first.sigma, None, steps[1], gamma, rng)
-        region = last.to_region()._replace(chains=last.states[:, 1:])
-        return ExplorationResult([region], noisy=True, levels=descent.levels)
-    reserve = len(starts) * (steps[1] + 1)  # for the second chains, and one look at where they end
-    labels, _ = yield from label_regions(simulator, first.ends, gamma, limit - reserve)
-    room = max(limit - simulator.n_sim - reserve, 0) // (steps[1] + 1)
-    few, many = REGIONS.chains_per_region
-    wanted = min(max(few, math.ceil(REGIONS.points_per_dim * dim / steps[1])), many)
-    chosen = _replicate_seeds(labels, wanted, min(room, REGIONS.max_replicated), rng)
-    first, labels = first.select(chosen), labels[chosen]
-    n = labels.max() + 1  # the points of subset simulation belong to the only region
-    only = descent if n == 1 else None
-    directions = np.array([_estimate_direction(first.select(labels == k), only) for k in range(n)])
-    last = yield from _pcn_chains(simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng)
-    labels, scattered = yield from label_regions(simulator, last.ends, gamma, limit)
-    regions = _collect_regions(first, last, labels, REGIONS.late_steps_high_dim if high_dim else REGIONS.late_steps)
-    if len(regions) == 1:
-        regions = [_add_subset_points(regions[0], descent)]
-    return ExplorationResult(regions, noisy=False, scattered=scattered, levels=descent.levels)
+    steps = REGIONS.steps if starts.shape[1] <= HIGH_DIM else REGIONS.steps_high_dim
+    chains = yield from _run_chains(simulator, starts, steps, gamma, rng)
+    ends = chains.chains[:, -1]
+    if (yield from is_noisy(simulator, ends, gamma, rng)):
+        return ExplorationResult([chains.late(np.arange(len(ends)))], noisy=True)
+    labels, scattered = yield from label_regions(simulator, ends, gamma, limit)
+    regions = [chains.late(np.flatnonzero(labels == k)) for k in range(labels.max() + 1)]
+    return ExplorationResult(regions, noisy=False, scattered=scattered)
 
 
-def _collect_regions(first: ChainPaths, last: ChainPaths, labels: Labels, late: int) -> list[Region]:
-    """Return the regions: states of the last chains but their first, proposals to them and late ones to the first.
+class _Chains(NamedTuple):
+    """States of chains (n, steps, d), what was proposed to them (n, steps, d), and its outcomes (n, steps)."""
 
-    Late are the last `late` steps: early proposals to wide failures are far from where failures are likely.
-    """
-    dim = last.states.shape[2]
-    proposals = np.concatenate([first.proposals[:, -late:], last.proposals], axis=1)
-    f = np.concatenate([first.f[:, -late:], last.f], axis=1)
-    regions = []
-    for k in range(labels.max() + 1):
-        own = labels == k
-        regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
-    return regions
+    chains: FloatArray
+    proposals: FloatArray
+    f: FloatArray
+
+    def late(self, own: NDArray[np.int64]) -> Region:
+        """Return the last half of some chains, and what was proposed shortly before too."""
+        half, before = self.f.shape[1] // 2, 3 * self.f.shape[1] // 4
+        proposals = self.proposals[own, -before:].reshape(-1, self.chains.shape[2])
+        return Region(self.chains[own, -half:], proposals, self.f[own, -before:].ravel())
 
 
-def _pcn_chains(
-    simulator: Simulator,
-    u: FloatArray,
-    sigma: FloatArray,
-    directions: FloatArray | None,
-    steps: int,
-    gamma: float,
-    rng: np.random.Generator,
-) -> SimulationSteps[ChainPaths]:
-    """Move chains inside the failure region by pCN, each with its own step.
+def _run_chains(
+    simulator: Simulator, u: FloatArray, steps: int, gamma: float, rng: np.random.Generator
+) -> SimulationSteps[_Chains]:
+    """Move chains from failing points (n, d) inside the failure region by pCN, each with its own step.
 
     The proposal sqrt(1 - sigma^2) u + sigma xi, xi ~ N(0, I), leaves N(0, I) invariant; it is accepted if it fails.
-    With directions the step sigma is that along them, and every other direction is drawn nearly afresh: failures
-    beyond a plane are standard normal there, and chains forget where they started at once.
     """
-    across = np.ones(len(u))
-    states, proposals, outcomes = [], [], []
+    sigma, states, proposals, outcomes = np.full(len(u), 0.5), [], [], []
     for step in range(1, steps + 1):
-        width = sigma if directions is None else across
-        xi = rng.standard_normal(u.shape)
-        proposal = np.sqrt(1 - width**2)[:, None] * u + width[:, None] * xi
-        if directions is not None:
-            along = np.sqrt(1 - sigma**2) * (u * directions).sum(axis=1) + sigma * (xi * directions).sum(axis=1)
-            proposal += (along - (proposal * directions).sum(axis=1))[:, None] * directions
+        proposal = np.sqrt(1 - sigma**2)[:, None] * u + sigma[:, None] * rng.standard_normal(u.shape)
         f = yield from simulator.evaluate(proposal)
         fails = f <= gamma
         u = np.where(fails[:, None], proposal, u)
-        if directions is None:
-            change = REGIONS.adaptation * (fails - REGIONS.chain_acceptance) / math.sqrt(step)
-            sigma = np.clip(sigma * np.exp(change), REGIONS.min_step, 1.0)
-        else:
-            across = np.clip(across * np.where(fails, *REGIONS.across_factors), REGIONS.min_across, 1.0)
-            sigma = np.clip(sigma * np.where(fails, *REGIONS.along_factors), REGIONS.min_step, 1.0)
+        sigma = np.clip(sigma * np.exp(0.7 * (fails - REGIONS.acceptance) / math.sqrt(step)), 0.02, 1.0)
         states.append(u)
         proposals.append(proposal)
         outcomes.append(f)
-    return ChainPaths(np.stack(states, axis=1), np.stack(proposals, axis=1), np.stack(outcomes, axis=1), sigma)
+    return _Chains(np.stack(states, axis=1), np.stack(proposals, axis=1), np.stack(outcomes, axis=1))
 
 
-def _is_noisy(simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator) -> SimulationSteps[bool]:
-    """Return whether points right beside failing ones (n, d) do not always fail."""
-    u = rng.permutation(u)[: REGIONS.probes]
-    f = yield from simulator.evaluate(u + REGIONS.probe_distance * rng.standard_normal(u.shape))
+def is_noisy(simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator) -> SimulationSteps[bool]:
+    """Return whether of 30 points right beside failing ones (n, d) fewer than nine in ten fail.
+
+    No f of a simulation changes over a distance of 1e-6, save at jumps or by noise.
+    """
+    u = rng.permutation(u)[:30]
+    f = yield from simulator.evaluate(u + 1e-6 * rng.standard_normal(u.shape))
     return float((f <= gamma).mean()) < REGIONS.noisy_share
 
 
@@ -251,16 +200,16 @@ def label_regions(
     labels = np.full(len(u), -1)
     scattered = False
     joined, all_compared = np.zeros((len(u), len(u)), dtype=bool), False
-    for k in range(REGIONS.max_regions):
+    for k in range(REGIONS.most):
         free = np.flatnonzero(labels < 0)
-        scattered = k >= REGIONS.many_regions and len(free) > REGIONS.scattered_share * len(u)
+        scattered = k >= REGIONS.many and len(free) > 0.25 * len(u)
         if len(free) == 0 or scattered:
             break
         first = free[np.argmin((u[free] ** 2).sum(axis=1))]
         labels[first] = k
         others = free[free != first]
         if not all_compared:
-            all_compared = len(free) <= REGIONS.few_points
+            all_compared = len(free) <= 8
             left, right = np.full_like(others, first), others
             if all_compared:
                 left, right = free[np.stack(np.triu_indices(len(free), 1))]
@@ -275,32 +224,3 @@ def label_regions(
         # |u - m|^2 is least where u . m - |m|^2 / 2 is largest.
         labels[free] = np.argmax(u[free] @ means.T - 0.5 * (means**2).sum(axis=1), axis=1)
     return labels, scattered
-
-
-def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the indices of all chains, those of small regions repeated until each has `wanted`, or `room` is used."""
-    more = []
-    for k in range(labels.max() + 1):
-        own = np.flatnonzero(labels == k)
-        more.append(rng.choice(own, max(wanted - len(own), 0)))
-    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[:room]])
-
-
-def _estimate_direction(paths: ChainPaths, descent: SubsetPoints | None) -> FloatArray:
-    """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
-    region = paths.to_region()
-    if descent is not None:
-        region = _add_subset_points(region, descent)
-    plane = fit_hyperplane(region.u, region.f)
-    if plane.explained > REGIONS.direction_r2:
-        return plane.axis
-    mean = paths.states[:, -REGIONS.mean_steps :].mean(axis=(0, 1))
-    return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
-
-
-def _add_subset_points(region: Region, descent: SubsetPoints) -> Region:
-    """Return a region with the lower points of subset simulation, if its own are too few for a regression."""
-    if len(region.u) >= REGIONS.min_points_per_dim * region.u.shape[1] or len(descent.f) == 0:
-        return region
-    low = descent.f <= np.quantile(descent.f, REGIONS.lower_share, method="lower")  # f may be infinite
-    return Region(region.chains, np.concatenate([region.u, descent.u[low]]), np.concatenate([region.f, descent.f[low]]))

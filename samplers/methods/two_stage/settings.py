@@ -1,9 +1,158 @@
-"""Settings of two-stage: the numbers of its stages, each with its reason.
+"""Settings of two-stage: each has its paper, or its reason and the measurement that chose it.
 
-Users set `TwoStage.n` only. Where no other reason stands beside a number, it was chosen together with the others on the
+Users set `TwoStage.n` only. Where nothing else stands beside a number, it was chosen together with the others on the
 problems of the benchmark of samplers at 6,000 simulations: some 30 configurations, up to 40 runs each, by which
 differences in gain of less than a factor of two cannot be told from chance.
 """
+
+from typing import ClassVar
+
+HIGH_DIM = 40
+"""Above so many dimensions a Gaussian has one direction of its own: some hundred points show no more."""
+
+
+class BUDGET:
+    """What a run is worth doing with."""
+
+    usual = 6000  # Simulations that the sizes of the exploration hold for; they grow in proportion, above with the root
+    least = 400  # With fewer simulations an exploration is not worth its draws
+    sufficient = 1500  # With fewer, one of two like regions is missed in 3 to 30 % of runs, without any sign
+    common_share = 0.1  # Where this share of the base draws fails, plain Monte Carlo is as good as anything
+
+
+class EXPLORATION:
+    """Draws of the exploration (`exploration.py`) at the usual budget."""
+
+    base = 500  # Base draws; five levels of a tenth each reach 1e-5 from there
+    wide = ((1.5, 400), (2.2, 120), (3.0, 80), (4.2, 100))
+    """(s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15; at s = 1.5 a ball that f does not
+    announce is hit two to three times as often as by base draws: with 120 of them 7 of 20 runs on pit_d5 missed it."""
+    level = 250  # Points of each level of subset simulation
+    level_fraction = 0.1  # Conditional probability of a level (Au and Beck 2001)
+    level_acceptance = 0.44  # Acceptance that its chains are adapted to (Papaioannou, Betz, Zwirglmaier, Straub 2015)
+    level_share = 0.45  # Share of the budget after which no further level is begun
+    common_failures = 5
+    """Failures among the base draws from which on no level is begun, and the second round counts in p: chains start
+    from these failures, and one round shows how to describe what is so common."""
+    starts = 24  # Chains from wide failures at most; as many more from failures of the lines and the levels
+    contractions = 8  # Tries to bring a start that is unlikely by its length to a likely one
+    share = 0.65  # Share of the budget for the whole exploration
+
+
+class LINES:
+    """Lines of descent (`exploration.py`) at the usual budget."""
+
+    n = 24  # Lines; half of them arrive, as a rule. With 30 no c.o.v. was smaller on four problems (20 seeds each)
+    acceptance = 0.3  # Share of fresh steps that shall be taken
+    steps = 300  # Lines that go on, times steps taken, at most: where failures are far off, few that arrive are better
+    limit = 600  # Simulations after which all lines end
+    many_regions = 6
+    """In more than `HIGH_DIM` dimensions lines in so many regions mean a shell or a ring: chains would not relax
+    there, and none are run."""
+
+
+class REGIONS:
+    """Chains inside the failure region, and how regions are separated (`regions.py`)."""
+
+    steps = 12  # Steps of the chains
+    steps_high_dim = 16  # The same above `HIGH_DIM` dimensions, where a wide failure has further to go
+    acceptance = 0.35  # Acceptance that the step is adapted to; Papaioannou and others, 2015, adapt to 0.44
+    noisy_share = 0.9  # Where less than this share of points right beside failing ones fail, f is noisy
+    most = 16  # Regions that are separated at most
+    many = 8  # Number of regions from which on failure may be something like a shell
+
+
+class SLOPES:
+    """Gradients of f by finite differences (`exploration.py`)."""
+
+    min_dim = 15  # Dimensions from which on they are sought: with fewer, chains show as much
+    shares = (0.22, 0.3)
+    """Share of what is left for them at most: 17 gradients in 40 dimensions. The second one above `HIGH_DIM`
+    dimensions, and where the regions are pieces of something like a shell."""
+    most = 20  # Gradients at most. With 12, one direction of three of screen_d40 was not found in one run of 24
+    few = 0.65
+    """The directions are few where the gradients are worth so many equal directions, over those that as many random
+    gradients would be worth. On the shell sphere_d20 1, on series6_d25 0.55, on oscillator_d100 0.4."""
+    most_axes = 12  # Directions at most. With 8, the c.o.v. of duffing_d60 was 0.21 for 0.15 (24 runs each)
+
+
+class FIT:
+    """Gaussians fitted to weighted points (`mixture.py`)."""
+
+    sizes = (1, 2, 3, 4, 6, 8)  # Numbers of components tried; two of them without a better score end the search
+    ess = (30.0, 3.0)
+    """Effective points that a component is moved to, as its mean and a shrunk covariance need them, at least and per
+    dimension; where weights are less even, they are raised to a power under 1."""
+    standard_errors = 2.0  # So many of them raise a variance under 1: too small a variance makes weights unbounded
+
+
+class PROPOSAL:
+    """Rounds of draws, and the shares of the components in a proposal (`refinement.py`)."""
+
+    round_shares = (0.09, 0.12, 0.14)  # Share of what is left that each round draws; the rest is for the estimate
+    further_shares = (0.14, 0.14)  # The same of further rounds, while a region is badly described
+    described = 0.1
+    """Effective failures over failures of a round in a region, of which it has 10 or more, from which on the region is
+    described. On unseen states less than this told 12 of 18 wrong runs from right ones, and 8 of 122 right ones too."""
+    good_rate = 0.1  # Independent failures for each draw of a round with which its proposal describes the failures
+    base_share = (0.05, 0.1)  # Least share of base draws: no weight exceeds 20; the second one where f is noisy
+    tempered_share = (0.1, 0.5)
+    """Least share of tempered Gaussians, dealt out among the regions by the roots of their shares of the failures: the
+    best weights for the failures met so far may leave a region hardly any. Without this the variance of a draw was 1.2
+    times as large on common3_d9 and banana_d8, and 2.1 times on loads_d7 (20 runs each). The second where f is noisy:
+    q^(1/2) phi^(1/2) is the best proposal then."""
+    region_share = (0.5, 0.2)
+    """Share of the draws that is dealt out evenly among the regions, in the rounds and in the estimate: weights of a
+    region's first draws can be so uneven that it seems to have no mass."""
+    radial_share = 0.05
+    """Least share of radial components in few dimensions, and wherever the regions are no more than pieces of a shell:
+    they reach failures beside the regions, of which one draw would outweigh all others. In 160 runs of `CutIn-v0` with
+    its base `us101-15-offsets` 0, 2, 5 and 10 % had gains of 135, 219, 320 and 242."""
+    radial_dim = 20
+    """Few dimensions. In 25 (series6, 60 runs) it took the coverage from 93 to 87 % and the gain from 48 to 5."""
+    spread_share = 0.4
+    """Share of the component that is as wide as the failures in the span of the slopes, where the regions are pieces of
+    a shell, or while draws are worth less than `good_rate`: there the failures form a ring, and Gaussians fitted to
+    some of them leave gaps. Without it the second moment on oscillator_d100 was 800 to 2,000 times p^2, with it 40 to
+    70."""
+    initial_shares: ClassVar[dict[str, float]] = {
+        "base": 0.1,
+        "radial": 0.1,
+        "gaussian": 0.5,
+        "linear": 0.5,
+        "corner": 0.3,
+        "explored": 0.2,
+        "tempered": 0.25,
+        "spread": 0.2,
+        "directional": 0.1,
+    }
+    """Shares of the kinds where nothing is known yet; of those present, in proportion. Without a kind the stated
+    variance (median) is 131 times as large on sphere_d20 (radial), 15 times on two_d30 and 4 times on three_d6 and
+    steps_d6 (linear), 20 times on corner_d5 (corner), 20 times on cones_d13 (explored) and 14 times (directional)."""
+
+
+class FALLBACK:
+    """When a proposal is given up for subset simulation (`method.py`)."""
+
+    early_rates = (0.005, 0.006)
+    """What each draw of the first rounds must be worth, in independent failures. Less cannot be told from chance; with
+    0.008 and more, proposals are given up that are several times better by the third round."""
+    late_rate = 0.04
+    """The same for later rounds, times the levels: subset simulation has an independent failure for each 100 levels
+    simulations, and the weights that were met are about four times flatter than all of them."""
+    max_typical = 30.0
+    """How many times p a typical point of most regions may weigh as a draw: 1 to 3 is usual, 17 was seen to do. From
+    `PROPOSAL.good_rate` on it does not apply."""
+
+
+class DOUBT:
+    """When an estimate is doubted (`stratified.py`)."""
+
+    false_alarm = 1e-3  # Probability with which a check of the base draws warns of a right estimate
+    max_deviation = 4.0
+    """Standard errors between rounds and estimate; a normal distribution exceeds it once in 16,000 runs."""
+    max_point_share = 0.25  # Share of p that a typical point of a region may stand for as a draw
+    max_unseen_share = 0.3  # Share of p that may be in regions that were not found
 
 
 class LINEAR_MODEL:
@@ -81,274 +230,3 @@ class EDGES:
     """|u|^2 there, times this, is where radial draws begin: the least of few lies beyond the edge of many."""
     min_radial_shape = 0.3
     """Least shape of the Gamma distribution of |u|^2: with less, nearly all draws are at its start."""
-
-
-class SUBSPACE:
-    """Mixtures fitted to weighted points (`mixture.py`)."""
-
-    high_dim = 40  # Above so many dimensions a component has one direction of its own: some hundred points show no more
-    sizes = (1, 2, 3, 4, 6, 8)  # Numbers of components tried; `max_worse` of them without a better score end the search
-    max_worse = 2  # The score of a fit is uneven in their number: after one that is worse, a better one may follow
-    max_em_iterations = 25  # M-steps at most
-    min_relative_gain = 1e-3  # EM ends where a step raises the log likelihood by less than this share of it
-    em_restarts = 3  # Starts for each number of components; k-means++ draws its centres
-    min_ess = 2.0  # Points that any component is taken to rest on: the formulae divide by their number
-    refit_steps = 2  # M-steps between two rounds of draws; the rounds go on from there
-    min_refit_points = 5  # A component with fewer points stays where it is
-    refit_ess = 30.0
-    """Effective points that a component is fitted to, as its mean and a shrunk covariance need them ..."""
-    refit_ess_per_dim = 3.0
-    """... or so many per dimension; where weights are less even, they are raised to a power under 1."""
-    points_per_refit_ess = 3.0
-    """Points of a component for each of them: no more is asked of it than a third of its points."""
-    power_step = 0.1  # By how much the power falls from trial to trial; the effective number of points grows as it does
-    max_spread = 4.0  # Largest variance along the one direction in high dimensions; points of another region give more
-    standard_errors = 2.0  # So many of them raise a variance under 1: too small a variance makes weights unbounded
-    max_mean_excess = 0.5
-    """Share of a mean taken off as noise at most: of few points in hundreds of dimensions it is all noise."""
-    covariance_parameters_per_dim = 2.0
-    """Parameters of a covariance that BIC counts at most, per dimension: with all d (d + 1) / 2 of them some dozens of
-    points would never have a second component."""
-    min_bic_ess = 3.0  # Least number of points that BIC takes: log(n) would fall under 1 with fewer
-    points_per_component = 4.0  # Effective points for each component at least
-
-
-class EXPLORATION:
-    """Draws of the exploration (`exploration.py`); their numbers hold for `usual_budget` simulations."""
-
-    usual_budget = 6000  # Up to here sizes grow in proportion to the budget, above with its square root
-    base = 500  # Base draws; five levels of a tenth each reach 1e-5 from there
-    wide = ((1.5, 120), (2.2, 120), (3.0, 80))
-    """(s, number); at s = 3 a half-space at beta = 4.5 is hit by one draw in 15."""
-    deep_scale = 3.3  # Where the levels went so far that wide draws should have a larger s, there are ...
-    deep_draws = 80  # ... so many more, with that s.
-    depth_ratio = 1.45  # Distance of the levels' end, beta, over s: one draw in 14 is beyond a half-space there
-    level = 250  # Points of each level of subset simulation; `least_level` where the budget is small
-    least_level = 100
-    level_fraction = 0.1  # Conditional probability of a level (Au and Beck 2001)
-    common_failures = 5
-    """Failures among the base draws from which on no level is begun, and the second round counts in p: chains start
-    from these failures, and one round shows how to describe what is so common."""
-    points_per_seed = 3  # Points of a level for each of its seeds at least: chains take two steps or more
-    initial_scale = 0.6  # First step of the chains of subset simulation, as in `AdaptiveSubsetSimulation`
-    level_acceptance = 0.44  # Acceptance that it is adapted to (Papaioannou, Betz, Zwirglmaier and Straub, 2015)
-    max_levels = 30  # Levels at most; the share of the budget ends the descent first unless f ties
-    starts = 24  # Chains from wide failures at most; `least_starts` where the budget is small
-    least_starts = 10
-    level_starts = 24  # The same for failures of subset simulation; they replace wide failures that are missing
-    least_level_starts = 6
-    bisections = 3  # Steps of a wide failure towards the origin: its edge is then known to an eighth of the way
-    chain_cost = 25  # Simulations that a chain needs at most before it is sorted: bisection, two walks, points half way
-    descent_share = 0.45  # Share of the budget after which no further level is begun
-    share = 0.65  # Share of the budget for the whole exploration
-
-
-class LINES:
-    """Lines of descent (`exploration.py`); numbers of simulations hold for `EXPLORATION.usual_budget`."""
-
-    n = 24
-    """Lines. Half of them arrive, as a rule. With 30 the exploration costs 60 to 110 simulations more, and the c.o.v.
-    was no smaller on four problems (20 seeds each)."""
-    root_share = 0.1  # Share of the base draws that lines start from: higher up they cost more and lead no further
-    initial_step = 0.35  # First step
-    acceptance = 0.3  # Share of fresh steps that shall be taken ...
-    adaptation = 0.5  # ... and change of the log step per unit of it.
-    step_range = (0.03, 1.0)  # Least and largest step
-    most_tries = 3  # Tries at once of each line where others have arrived, so that the batches do not become small
-    steps = 300  # Lines that go on, times steps taken, at most: where failures are far off, few that arrive are better
-    limit = 600  # Simulations after which all lines end
-    most_arrived = 0.6  # Share of the lines that has arrived when the others have `patience` times the median time
-    patience = 2.0
-    first_look = 450  # Simulations after which lines are given up if less than `few_arrived` of them have arrived
-    few_arrived = 0.15
-    starts = 4  # Lines of each region from which chains start
-    many_regions = 6
-    """In more than `SUBSPACE.high_dim` dimensions lines in so many regions mean a shell or a ring: chains would not
-    relax there, and none are run."""
-
-
-class TERMS_ALONE:
-    """Searches on single terms of f (`terms_alone.py`)."""
-
-    lines = 4  # Lines of descent, and starts of chains, of each term, as of each region
-    line_share = 0.15  # Share of what is left for lines on terms that were the least somewhere, and failed nowhere
-    scout_share = 0.1  # The same for terms that were the least nowhere
-    usual_cost = 180  # Simulations for the lines of a term; of more terms than that allows, some are left out
-    chain_share = 0.15  # Share of what the exploration leaves for the chains from the ends of the lines
-    least_density = 1e-5
-    """Failures less likely than the likeliest ones by this factor start no chains: they matter too little."""
-
-
-class REGIONS:
-    """Chains inside the failure region, and how regions are separated (`regions.py`)."""
-
-    initial_step = 0.5  # pCN step before any adaptation
-    steps = (5, 6)  # Steps of the chains before and after they are sorted into regions
-    steps_high_dim = (8, 8)  # The same above `SUBSPACE.high_dim` dimensions, where a wide failure has further to go
-    chain_acceptance = 0.35  # Acceptance that the step is adapted to; Papaioannou and others, 2015, adapt to 0.44
-    adaptation = 0.7  # Change of the log step per unit of acceptance in the first step; it falls with their root
-    min_step = 0.02  # Least pCN step
-    across_factors = (1.1, 0.75)
-    """Factors of the step across the given direction after a failing proposal and after another one: in balance at an
-    acceptance of ln(1 / 0.75) / ln(1.1 / 0.75) = 0.75, for across the direction fresh draws are nearly always right."""
-    min_across = 0.05  # Least step across the given direction
-    along_factors = (1.05, 0.9)  # The same along the given direction: in balance at 0.68
-    many_regions = 8  # Number of regions from which failure may be something like a shell
-    scattered_share = 0.25  # Where this share of the points is in none of `many_regions` regions, it is
-    few_points = 8  # So many points or fewer are all compared with each other at once, not region by region
-    max_regions = 16  # Regions that are separated at most
-    chains_per_region = (8, 24)  # Chains of each region at least, in few dimensions and in many
-    points_per_dim = 2.5  # Points of a region per dimension, within these: a covariance and a regression need them
-    max_replicated = 60  # Chains that are added to reach it at most, over all regions
-    probes = 30  # Points beside failing ones that show whether f is noisy
-    probe_distance = 1e-6
-    """How far beside, in standard deviations: no f of a simulation changes over it, save at jumps or by noise."""
-    noisy_share = 0.9  # Where less than this share of the probes fail, f is noisy
-    late_steps = 2  # Of the steps before sorting, the last ones whose proposals describe f around a region
-    late_steps_high_dim = 4  # The same above `SUBSPACE.high_dim` dimensions
-    direction_r2 = 0.5  # From this R^2 on, chains follow the direction in which f falls, else that of their mean
-    mean_steps = 3  # Last steps of the chains that this mean is of
-    min_points_per_dim = 3
-    """With fewer points per dimension around the only region, points of subset simulation join them."""
-    lower_share = 0.7  # Share of the points of subset simulation that do, those with the lowest f
-
-
-class SLOPES:
-    """Gradients of f by finite differences (`exploration.py`)."""
-
-    min_dim = 15  # Dimensions from which on they are sought: with fewer, chains show as much
-    share = 0.22  # Share of what is left for them at most: 17 gradients in 40 dimensions at 6,000 simulations
-    high_dim_share = 0.3
-    """The same above `SUBSPACE.high_dim` dimensions, where a component has one direction without slopes, and where the
-    regions are pieces of something like a shell."""
-    least = 4  # Gradients that two directions can be told from many with
-    most = 20  # Gradients at most. With 12, one direction of three of screen_d40 was not found in one run of 24.
-    step = 0.05  # Of a finite difference, in standard deviations: f bends little over it, and rounding is nothing
-    few = 0.65
-    """The directions are few where the gradients are worth so many equal directions, over those that as many random
-    gradients would be worth. On the shell sphere_d20 1, on series6_d25 0.55, on oscillator_d100 0.4."""
-    explained = 0.99  # Share of the squares of new gradients in known directions from which on no more are made
-    least_part = 0.005  # Share of the gradients' squares that a direction must hold: noise of f bends gradients less
-    most_axes = 12  # Directions at most. With 8, the c.o.v. of duffing_d60 was 0.21 for 0.15 (24 runs each).
-
-
-class REFINEMENT:
-    """Rounds of draws, and the shares of the components in a proposal (`refinement.py`)."""
-
-    round_shares = (0.09, 0.12, 0.14)  # Share of what is left that each round draws; the rest is for the estimate
-    counted_from = 2
-    """Rounds that do not count in p, the first ones: their proposals may not describe the failures yet. The draws of
-    the third were worth 0.8 to 1.6 times as much as as many of the last ones, on four problems (30 runs each)."""
-    further_shares = (0.14, 0.14)  # The same of further rounds, while the last one is worth less than `good_rate`
-    good_rate = 0.1  # Independent failures for each draw of a round with which its proposal describes the failures
-    base_share = 0.05  # Least share of base draws: no weight exceeds 20
-    noisy_base_share = 0.1  # The same where f is noisy
-    tempered_share = 0.1
-    """Least share of tempered Gaussians, dealt out among the regions by the roots of their shares of the failures. The
-    best weights for the failures met so far may leave a region hardly any: without this the variance of a draw was 1.2
-    times as large on common3_d9 and banana_d8, and 2.1 times on loads_d7 (20 runs each)."""
-    extra_tempered_share = 0.2
-    """How much more of them, times the share of the draws from sharp components that did not fail; not where the
-    regions are pieces of a shell, for the spread component is wider."""
-    noisy_tempered_share = 0.5
-    """Least share of tempered Gaussians where f is noisy; q^(1/2) phi^(1/2) is the best proposal then."""
-    region_share = 0.5
-    """Share of the draws of a round that is dealt out evenly among the regions. Weights of a region's first draws can
-    be so uneven that it seems to have no mass: it must not be lost by that."""
-    final_region_share = 0.2  # The same for the estimate
-    radial_share = 0.05
-    """Least share of radial components in few dimensions, and wherever the regions are no more than pieces of a shell:
-    they reach failures beside the regions, of which one draw would outweigh all others. In 160 runs of `CutIn-v0` with
-    its base `us101-15-offsets` 0, 2, 5 and 10 % had gains of 135, 219, 320 and 242."""
-    radial_dim = 20
-    """Few dimensions. In 25 (series6, 60 runs) it took the coverage from 93 to 87 % and the gain from 48 to 5."""
-    spread_share = 0.4
-    """Share of the component that is as wide as the failures in the span of the slopes, where the regions are pieces of
-    a shell, or while draws are worth less than `good_rate`: there the failures form a ring, and Gaussians fitted to
-    some of them leave gaps. Without it the second moment on oscillator_d100 was 800 to 2,000 times p^2, with it 40 to
-    70, and 26 with the half-spaces of the pieces of f; with 0.15 of it these gave 150."""
-    explored_share = 0.01  # Share that components from the exploration keep until the last round
-    min_share = 0.004  # Components with less of the draws are left out
-    wide_scale = 1.5  # Standard deviation of the wide component
-    tempering = (0.5,)  # Powers t of q^t phi^(1 - t)
-    noisy_tempering = (0.5, 0.25)  # The same where f is noisy
-    gaussians_per_region = 3  # Gaussians fitted to the chains of a region at most: it has some dozens of them
-    noisy_gaussians = 8  # The same where f is noisy: all of it is one region then
-    points_per_chain = 2.0  # Independent points that a chain is worth
-    min_refit_failures = 6  # Failures, all in all, from which on Gaussians and half-spaces are fitted again
-    min_radial_failures = 20  # Failures that a radial component needs
-    min_log_ratio = 1.0  # A draw belongs to the region whose Gaussian is densest there, if it is e times phi or more
-    probit_scale = 1.702
-    """Log odds over the argument of Phi that is next to them: noise is near normal, and the logistic curve has far
-    heavier tails (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)."""
-    logistic_penalty = 100.0  # Inverse strength of the penalty (C of scikit-learn): hardly any
-    logistic_iterations = 2000  # More than the noisy problems of the catalogue need; scikit-learn warns of too few
-    quadratic_dim = 20  # Up to here the log odds of failure are quadratic in u, not linear: 231 coefficients at most
-
-
-class FALLBACK:
-    """When a proposal is given up for subset simulation (`method.py`)."""
-
-    min_fallback_budget = 300  # Simulations under which subset simulation is not worth it
-    early_rates = (0.005, 0.006)
-    """What each draw of the first rounds must be worth, in independent failures. Less cannot be told from chance; with
-    0.008 and more, proposals are given up that are several times better by the third round."""
-    sloped_rate = 0.25
-    """Share of these rates that is enough where components lie in the span of slopes: their draws leave few places out,
-    so that the weights met are about as uneven as all of them."""
-    relative_rate = 0.04
-    """The same for the last round, times the levels: subset simulation has an independent failure for each 100 levels
-    simulations, and the weights that were met are about four times flatter than all of them."""
-    max_typical = 30.0
-    """How many times p a typical point of most regions may weigh as a draw: 1 to 3 is usual, 17 was seen to do. From
-    `REFINEMENT.good_rate` on it does not apply."""
-
-
-class DIAGNOSTICS:
-    """When an estimate is doubted (`stratified.py`)."""
-
-    false_alarm = 1e-3  # Probability with which a check of the base draws warns of a right estimate
-    max_deviation = 4.0
-    """Standard errors between rounds and estimate; a normal distribution exceeds it once in 16,000 runs."""
-    min_rounds_ess = 30.0  # Independent failures that the rounds must be worth to be compared
-    min_final_rate = 0.025
-    """Independent failures for each final draw; with less, there may be heavier weights than any met."""
-    max_point_share = 0.25  # Share of p that a typical point of a region may stand for as a draw
-    max_unseen_share = 0.3  # Share of p that may be in regions that were not found
-
-
-class TWO_STAGE:
-    """All settings of a run."""
-
-    min_exploration_budget = 400  # With fewer simulations an exploration is not worth its draws
-    sufficient_budget = 1500  # With fewer, one of two like regions is missed in 3 to 30 % of runs, without any sign
-    common_share = 0.1  # Where this share of the base draws fails, plain Monte Carlo is as good as anything
-    monte_carlo_batch = 10_000  # Base draws of a batch of plain Monte Carlo
-    target_batches = 10  # With a target c.o.v., a batch of the estimate is the budget divided by this ...
-    min_target_batch = 100  # ... but at least so many draws.
-    max_batches = 100  # Batches after which a target c.o.v. is given up where max_sim does not say.
-    min_stratum_draws = 10
-    """Of components with fewer draws the second moment stands in for the variance: a handful has none."""
-    draws_per_control = 30
-    """Draws of a round for each kind of component from which on weights are calibrated: slopes of fewer bias."""
-
-
-INITIAL_SHARES = {
-    "base": 0.1,
-    "wide": 0.05,
-    "radial": 0.1,
-    "gaussian": 0.5,
-    "linear": 0.5,
-    "corner": 0.3,
-    "explored": 0.2,
-    "tempered": 0.25,
-    "spread": 0.2,
-    "directional": 0.1,
-}
-"""Shares of the kinds where nothing is known yet; of those present, in proportion. What a kind is worth, on ten
-problems of the catalogue with 4 seeds each: without it the stated variance (median) is 131 times as large on sphere_d20
-(radial), 15 times on two_d30 and 4 times on three_d6 and steps_d6 (linear). On twelve others with 2 seeds it is 1.6
-times as large without `corner`, 20 times on corner_d5. Without `explored` 5 of 40 intervals miss p, with it none.
-Without `tempered` the variance is a quarter smaller: they are for noise, and for regions that are badly described.
-`wide` buys nothing over all (1.02 +- 0.05, 168 runs on 48 limit states): it guards the coverage on loads_d7 and
-crossing_d6."""

@@ -29,7 +29,7 @@ from samplers.importance import Draws, calibrate
 from samplers.methods.base import ComponentDraws
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.regions import Discovery
-from samplers.methods.two_stage.settings import DIAGNOSTICS, TWO_STAGE
+from samplers.methods.two_stage.settings import DOUBT
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample, effective_sample_size
 
@@ -121,7 +121,7 @@ class StratifiedSample:
         drawn = proposal.drawn(batch.counts)
         ratios, log_weights = drawn.kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
-        calibration = calibrate(ratios, owner, TWO_STAGE.draws_per_control)
+        calibration = calibrate(ratios, owner, 30)
         y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         log_weights = log_weights + np.log(calibration.factors)
@@ -169,7 +169,7 @@ class StratifiedSample:
         """
         if len(self.draws.f) == 0:
             return math.inf
-        many = self.counts >= TWO_STAGE.min_stratum_draws
+        many = self.counts >= 10
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         typical = min(float(self.typical.max(initial=0.0)), MAX_TYPICAL_SHARE * self.draws.n * self.p)
@@ -210,7 +210,7 @@ def check_base_draws(p: float, hits: int, n: int) -> list[str]:
 
     Base draws do not depend on the proposal: they hit a missed region as often as any other of its probability.
     """
-    if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > DIAGNOSTICS.false_alarm:
+    if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > DOUBT.false_alarm:
         return []
     expected = n * p
     return [f"{hits} of {n:,} base draws failed, but p = {p:.2e} predicts {expected:.2g}: a failure region was missed."]
@@ -224,42 +224,35 @@ def check_rounds(final: StratifiedSample, rounds: Sequence[Draws]) -> list[str]:
     """
     n = sum(draws.n for draws in rounds)
     log_weights = np.concatenate([np.empty(0), *(draws.log_weights for draws in rounds)])
-    if len(final.draws.f) == 0 or effective_sample_size(log_weights) < DIAGNOSTICS.min_rounds_ess:
+    if len(final.draws.f) == 0 or effective_sample_size(log_weights) < 30.0:
         return []
     w = np.exp(log_weights)
     before, error = float(w.sum()) / n, math.sqrt(float((w * w).sum())) / n
     apart = abs(before - final.p) / math.hypot(error, final.cov * final.p)
-    if apart < DIAGNOSTICS.max_deviation:
+    if apart < DOUBT.max_deviation:
         return []
     return [f"The search rounds give p = {before:.2e}, {apart:.1f} standard errors from the final estimate."]
 
 
-def check_efficiency(final: StratifiedSample) -> list[str]:
-    """Return a warning if the draws are worth so few failures that there may be weights heavier than any met."""
-    draws = final.draws
-    if len(draws.f) == 0 or draws.ess >= DIAGNOSTICS.min_final_rate * draws.n:
-        return []
-    return [f"Effective sample size of {draws.n:,} draws: {draws.ess:.0f} failures; larger weights may be missing."]
+def check_regions(final: StratifiedSample, uneven: int) -> list[str]:
+    """Return warnings about regions that the proposal does not describe: p may be far too low, and its error too.
 
-
-def check_regions(final: StratifiedSample) -> list[str]:
-    """Return a warning if a point of the exploration in some region would be a large share of p as a draw.
-
-    The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.
+    Final draws in `uneven` regions have very uneven weights; or a likely state of the chains in some region would be a
+    large share of p as a draw, of which that the draws met hardly any says nothing.
     """
-    share = final.typical / max(final.draws.n * final.p, 1e-300)
-    lost = int((share > DIAGNOSTICS.max_point_share).sum())
-    if lost == 0 or len(final.draws.f) == 0:
+    if len(final.draws.f) == 0:
         return []
-    return [
-        f"The proposal barely covers {lost} of {len(share)} regions found: one draw there adds {share.max():.0%} of p."
-    ]
+    n, share = len(final.typical), final.typical / max(final.draws.n * final.p, 1e-300)
+    lost = int((share > DOUBT.max_point_share).sum())
+    barely = f"The proposal barely covers {lost} of {n} regions found: one draw there adds {share.max():.0%} of p."
+    badly = f"The draws in {uneven} of {n} regions found have very uneven weights: p may be too low there."
+    return [barely] * (lost > 0) + [badly] * (uneven > 0)
 
 
 def check_discovery(p: float, discovery: Discovery, confidence: float) -> list[str]:
     """Return a warning if so few lineages reached failure that much of p may be in regions that were not found."""
     share = discovery.unseen_share(confidence)
-    if share <= DIAGNOSTICS.max_unseen_share:
+    if share <= DOUBT.max_unseen_share:
         return []
     searches = f"{discovery.lineages:.0f}"
     size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)" if p else "of unknown probability"
