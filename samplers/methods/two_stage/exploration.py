@@ -324,7 +324,9 @@ def find_regions(
     roots = len(np.union1d(descent.roots, line_roots))
     discovery = Discovery(count_lineages(roots, -density), descent.ceiling)
     most = max(2, (sizes.limit - simulator.n_sim) // CHAIN_COST)
-    chosen = rng.permutation(wide_u)[: min(sizes.starts, most)]
+    nearest, n_far = np.argsort((wide_u**2).sum(axis=1), kind="stable"), min(sizes.starts, most)
+    others = rng.permutation(nearest[n_far // 2 :])[: n_far - n_far // 2]  # no region that was met is left out by rule
+    chosen = wide_u[np.append(nearest[: n_far // 2], others)]
     far, (labels, _) = yield from join_batches(
         bisect_towards_origin(simulator, chosen, gamma), label_regions(simulator, ends, gamma, sizes.limit)
     )
@@ -335,8 +337,8 @@ def find_regions(
     order = rng.permutation(len(ends))
     few = [order[labels[order] == k][:LINE_STARTS] for k in range(n_regions)]  # of each region
     near = np.take(ends, np.concatenate([np.empty(0, dtype=np.int64), *few]), axis=0)
-    others = min(2 * sizes.starts, most) - len(far) - len(near)  # what wide draws do not reach, the levels do
-    starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others, 0)]])
+    more = max(min(2 * sizes.starts, most) - len(far) - len(near), 0)  # what wide draws do not reach, the levels do
+    starts = np.concatenate([far, near, rng.permutation(descent.failing)[:more]])
     if len(starts) == 0:
         return ExplorationResult([], noisy=False, discovery=discovery)
     starts = yield from contract(simulator, starts, gamma, rng)
