@@ -31,6 +31,7 @@ from samplers.method import Goal, Interrupted, Outcome, no_outcome_share
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals import Mixture, ProposalDistribution
 from samplers.sample import (
+    COARSE,
     DrawWeights,
     Interval,
     Level,
@@ -241,7 +242,7 @@ def describe_low_ess(draws: Draws) -> list[str]:
     """Return a sentence where the failing draws, one or more, are worth few independent ones."""
     if draws.ess >= LOW_ESS:
         return []
-    return [f"Effective sample size of the failing draws: {draws.ess:.0f}; the estimate is coarse."]
+    return [f"Effective sample size of the failing draws: {draws.ess:.0f}; {COARSE}."]
 
 
 def heavy_draw_warnings(draws: Draws) -> list[str]:
@@ -249,7 +250,7 @@ def heavy_draw_warnings(draws: Draws) -> list[str]:
     share = largest_weight_share(draws.log_weights)
     if share <= LARGE_SHARE:
         return []
-    return [f"One draw carries {100 * share:.0f} % of p: the proposal barely covers some failures."]
+    return [f"One draw carries {100 * share:.0f} % of p: the proposal barely covers some failures, and {COARSE}."]
 
 
 def round_record(level: float, n: int, log_weights: FloatArray) -> Level:

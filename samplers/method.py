@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms, check_settings
 from samplers.sample import (
+    COARSE,
     DrawWeights,
     Failures,
     Interval,
@@ -73,6 +74,9 @@ class Outcome:
     """Estimated coefficient of variation of p; inf where p = 0."""
     status: Status
     """End of the run."""
+    sequence: Interval | None = None
+    """Ends of p that hold at all looks together (an asymptotic confidence sequence), where the run stopped on what it
+    saw, as by `target_cov`; None where it did not, or nothing failed."""
     warnings: tuple[str, ...] = ()
     """Reasons for which the numbers are doubtful, a sentence each; empty if none is known."""
     remarks: tuple[str, ...] = ()
@@ -352,7 +356,7 @@ def _hit_warnings(hits: int, n: int) -> tuple[str, ...]:
     if hits == 0:
         return (f"None of {n:,} simulations failed: p = 0 with a one-sided interval.",)
     if hits < MANY_FAILURES:
-        return (f"Only {hits} of {n:,} simulations failed; the estimate is coarse.",)
+        return (f"Only {hits} of {n:,} simulations failed; {COARSE}.",)
     return ()
 
 

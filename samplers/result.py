@@ -140,8 +140,9 @@ class Estimate(EstimateData, Kept):
     def meets(self, max_p: float, given_base: bool = False) -> Verdict:
         """Return whether p is below a limit: it passes, fails, or is undecided.
 
-        Both ends of the interval are one-sided limits at the confidence (1 + `confidence`) / 2: take `confidence=0.9`
-        for a test at 95 %. Where the base distribution was fitted, the ends hold the uncertainty that its events leave.
+        Both ends of the interval (of `sequence`, where the run stopped on what it saw) are one-sided limits at the
+        confidence (1 + `confidence`) / 2: take `confidence=0.9` for a test at 95 %. Where the base distribution was
+        fitted, the ends hold the uncertainty that its events leave.
 
         Args:
             max_p: The limit.
@@ -270,12 +271,13 @@ class Estimate(EstimateData, Kept):
         )
 
     def __str__(self) -> str:
-        low, high = self.interval
+        (low, high), looks = self.interval, self.sequence
         gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
         cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
         lines = [
             f"P[f <= {self.gamma:g}] = {self.p:.3e}",
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
+            *(["  at every look [{:.3e}, {:.3e}], as the run stopped on what it saw".format(*looks)] if looks else []),
             *(f"  {part}" for part in self.parts),
             *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
@@ -362,7 +364,7 @@ class Estimate(EstimateData, Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
-        plain = "p interval confidence cov gamma n_sim base_draws unseen given gain warnings remarks choice seed"
+        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen given gain warnings remarks choice seed"
         uncertainty, points = self.base_uncertainty, self.failures
         data = {name: getattr(self, name) for name in plain.split()} | {
             "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),

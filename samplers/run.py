@@ -40,7 +40,16 @@ from samplers.replicate import (
     outcomes_of,
 )
 from samplers.result import Estimate
-from samplers.sample import Failures, Interval, SimulatedPoints, Status, clopper_pearson, gain_over_monte_carlo
+from samplers.sample import (
+    Failures,
+    Interval,
+    SimulatedPoints,
+    Status,
+    add_unseen,
+    clopper_pearson,
+    confidence_sequence,
+    gain_over_monte_carlo,
+)
 from samplers.strata import SumOfStrata
 
 MOST_SIMULATIONS = 10**12
@@ -382,8 +391,9 @@ class Run:
             remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
         number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
         found = {"status": status, "warnings": tuple(warnings), "remarks": tuple(remarks), "parts": parts}
+        interval = self._find_ends(whole)
         return Estimate(
-            **{**vars(whole), **found, "interval": self._find_ends(whole)},
+            **{**vars(whole), **found, "interval": interval, "sequence": self._find_sequence(whole, interval)},
             confidence=goal.confidence,
             gamma=goal.gamma,
             n_sim=self._n_sim,
@@ -416,6 +426,17 @@ class Run:
     def _keep_known(self, outcome: Outcome) -> Outcome:
         """Return the outcome of a part with p and the lower end of the failures that have an outcome."""
         return replace(outcome, p=outcome.p * (1 - outcome.no_outcome_share), interval=self._find_ends(outcome))
+
+    def _find_sequence(self, whole: Outcome, interval: Interval) -> Interval | None:
+        """Return the ends that hold at every look, around the interval; None where the run stops on nothing it sees."""
+        target = self._goal.target_cov or getattr(self._choice.method, "own_target", None)
+        if target is None or not (0 < whole.p < 1 and 0 < whole.cov < math.inf):
+            return None
+        low, high = confidence_sequence(whole.p, whole.cov, target, self._goal.confidence)
+        lineages = math.inf if whole.sample is None else whole.sample.lineages
+        high = add_unseen(whole.p, high, lineages, self._goal.confidence)
+        known = 1 - whole.no_outcome_share if self._on_error == "bound" else 1.0
+        return min(known * low, interval[0]), max(high, interval[1])
 
     def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""

@@ -7,6 +7,8 @@ References:
     Hall, "On the removal of skewness by transformation", Journal of the Royal Statistical Society B 54, 1992.
     Korn and Graubard, "Confidence intervals for proportions with small expected number of positive
     counts estimated from survey data", Survey Methodology 24, 1998 (degrees of freedom from units).
+    Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, "Time-uniform central limit theory and asymptotic confidence
+    sequences", Annals of Statistics 52(6), 2024 (theorem 2.2 and its optimal rho).
 """
 
 from __future__ import annotations
@@ -51,6 +53,10 @@ class Status(str, Enum):
 
     def __str__(self) -> str:
         return str(self.value)
+
+
+COARSE = "the estimate is coarse"
+"""Words of the warnings that say how coarse p is, which its interval holds; other warnings say that it may be wrong."""
 
 
 def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
@@ -348,11 +354,32 @@ def bound_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> float
     return min(1.0, whole + float((w[reached] * missed).sum()))
 
 
-def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
-    """Return p exp(-+ q s), p > 0, s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile; at most 1."""
-    quantile = float(stdtrit(df, 0.5 + confidence / 2))
-    half = quantile * math.sqrt(math.log1p(cov * cov))
+def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf, fold: float = 1.0) -> Interval:
+    """Return p exp(-+ q s), p > 0, s^2 = log(1 + cov^2), q `fold` times the normal or t quantile; at most 1."""
+    quantile = fold * float(stdtrit(df, 0.5 + confidence / 2))
+    half = min(quantile * math.sqrt(math.log1p(cov * cov)), 700.0)  # exp(709) is the largest number
     return p * math.exp(-half), min(1.0, p * math.exp(half))
+
+
+def confidence_sequence(p: float, cov: float, target_cov: float, confidence: float) -> Interval:
+    """Return ends of p, 0 < p < 1, that hold it at all looks together, whatever stops the run; asymptotic.
+
+    A mean of n draws stays, at all n with probability 1 - alpha, within
+
+        sigma sqrt(2 (n rho^2 + 1) / (n^2 rho^2) log(sqrt(n rho^2 + 1) / alpha)),    rho fixed beforehand,
+
+    which is sigma / sqrt(n) times a factor of v = n rho^2. Here it is the distance from log p, sigma / sqrt(n) is the
+    c.o.v., and n is counted in effective failures, 1 / cov^2: v = v0 (target_cov / cov)^2. The factor is least (1.55
+    times the normal quantile, at 95 %) for v0 = a + log(a) + 1, a = -2 log(alpha): at the target. On the scale of p
+    itself too many upper ends are too low where weights are skew. Few failures need no rule of their own: with one the
+    factor is above 10 at a target of 0.1, and t quantiles are used as in the interval. Each end alone holds with
+    probability 1 - alpha / 2.
+    """
+    alpha = 1 - confidence
+    a = -2 * math.log(alpha)
+    v = (a + math.log(a) + 1) * (target_cov / cov) ** 2
+    factor = math.sqrt(2 * (1 + 1 / v) * math.log(math.sqrt(v + 1) / alpha)) / float(ndtri(0.5 + confidence / 2))
+    return log_normal_interval(p, cov, confidence, degrees_of_freedom(cov**-2, independent=True), factor)
 
 
 def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -> float:

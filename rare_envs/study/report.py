@@ -31,9 +31,8 @@ from rare_envs.study.events import (
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
 from samplers.analysis.base_error import FIT_BIAS
-from samplers.analysis.gate import Decision
+from samplers.analysis.gate import find_doubt, judge_ends, widen_ends
 from samplers.analysis.reweight import refit_quantile
-from samplers.analysis.weighted import Reported
 from samplers.evaluate import Fault
 from samplers.sample import Interval
 
@@ -132,43 +131,10 @@ class Repeatability(NamedTuple):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class RateVerdict(Reported):
-    """Whether the collisions per million km are below a limit; undecided where a warning makes the ends doubtful."""
-
-    decision: Decision
-    max_rate: float
-    """Limit of the collisions per million km."""
-    confidence: float
-    """One-sided confidence of each end."""
-    low: float
-    high: float
-    reason: str
-    """Why it is undecided, beside the ends."""
-
-    def __str__(self) -> str:
-        """Return one sentence."""
-        ends = f"one-sided ends {self.low:.2g} and {self.high:.2g} at {100 * self.confidence:.4g} % confidence"
-        reason = f", as {self.reason}" if self.reason else ""
-        return f"{self.decision}: {self.max_rate:g} collisions per million km are the limit, {ends}{reason}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {**super().to_dict(), "text": str(self)}
-
-
-def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> RateVerdict:
+def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.Verdict:
     """Return whether a rate is below a limit; undecided for a reason, if there is one."""
-    low, high = rate.interval_per_million_km
-    decision: Decision = "passes" if high < limit else "fails" if low > limit else "undecided"
-    return RateVerdict(
-        decision="undecided" if reason else decision,
-        max_rate=limit,
-        confidence=round(0.5 + rate.confidence / 2, 12),
-        low=low,
-        high=high,
-        reason=reason,
-    )
+    ends = rate.interval_per_million_km
+    return judge_ends(limit, ends, rate.confidence, reason, quantity="the rate of collisions per million km")
 
 
 @dataclass(frozen=True)
@@ -289,7 +255,7 @@ class Report:
         return self.kinds.listed or (None,) * len(self.estimate.failures)
 
     @cached_property
-    def verdict(self) -> samplers.Verdict | RateVerdict | None:
+    def verdict(self) -> samplers.Verdict | None:
         """Whether p, or the rate, is below the limit of the question; None without a limit."""
         question = self.study.question
         if question.max_rate is not None:
@@ -303,15 +269,15 @@ class Report:
     def indecision(self) -> str:
         """Why nothing can be said of a limit, whatever it is; empty where something can."""
         said = self.estimate.meets(0.5, self.study.question.given_base).reason
-        return said or "".join(f"there is a warning: {doubt.rstrip('.')}" for doubt in self.doubts_of_f[:1])
+        return said or find_doubt(self.doubts_of_f)
 
     @property
     def judged_rate(self) -> CollisionRate:
         """The rate whose ends are compared with a limit: with the errors of the base, unless it is taken as given."""
         estimate, given = self.estimate, self.study.question.given_base
         rate = self._rate_of(estimate.p, estimate.cov, estimate.interval, None) if given else self.rate
-        assert rate is not None  # `run` has looked for the frequency before
-        return rate
+        assert rate is not None and rate.interval is not None  # `run` has looked for the frequency before
+        return replace(rate, interval=widen_ends(estimate, rate.interval))
 
     @cached_property
     def curve(self) -> samplers.Curve | None:

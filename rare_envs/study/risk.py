@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import agents
+import samplers
 from rare_envs import exposure
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import format_json, replace_text
@@ -27,7 +28,7 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, build_problem, prepare
-from rare_envs.study.report import RateVerdict, Report, find_frequency, judge_rate
+from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import check_no_results
 
@@ -176,7 +177,7 @@ class Risk:
         return sum_people(self.events)
 
     @cached_property
-    def verdict(self) -> RateVerdict | None:
+    def verdict(self) -> samplers.Verdict | None:
         """Whether the sum is below the limit of the question; None without a limit."""
         limit = self.scenarios[0].report.study.question.max_rate
         if limit is None:

@@ -92,6 +92,11 @@ class ImportanceSampling(Method):
         check_settings(self, half_width=(0.0, math.inf), n=1, batch=1, n_round=10, max_rounds=1)
         check_settings(self, rho=(0.0, 0.5), base_share=(0.0, 1.0))
 
+    @property
+    def own_target(self) -> float:
+        """Coefficient of variation to stop at where the goal has none."""
+        return self.half_width / QUANTILE
+
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""
         search = Search(inputs, goal, rng)
@@ -101,7 +106,7 @@ class ImportanceSampling(Method):
         if missed > MOST_UNREACHED:
             where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
             sampler, doubts = search.base, [f"{where}: draws from the base distribution replace it."]
-        target = self.half_width / QUANTILE if goal.target_cov is None else goal.target_cov
+        target = self.own_target if goal.target_cov is None else goal.target_cov
         limit = min(goal.budget - search.n_sim, self.n if goal.max_sim is None else goal.max_sim)
         outcome = yield from search.finish(sampler, self.batch, doubts, limit, target)
         met = outcome.cov <= target

@@ -118,7 +118,7 @@ def test_limits_are_compared_with_the_one_sided_ends_of_the_sum(brakings: str) -
         for limit, decision in ((1.001 * high, "passes"), (0.999 * low, "fails"), ((low * high) ** 0.5, "undecided")):
             found = judge(**{name: limit})
             assert found.verdict.decision == decision == found.to_dict()["gate"]["decision"]
-    assert f"undecided: {limit:g} collisions per million km are the limit, one-sided ends" in str(found.verdict)
+    assert f"undecided: {limit:g} is between the one-sided ends of the rate of collisions" in str(found.verdict)
     given = judge(max_rate=limit, given_base=True).verdict
     assert found.verdict.low < given.low < given.high < found.verdict.high
 
@@ -129,7 +129,7 @@ def test_a_limit_of_a_risk_is_one_of_the_sum_over_scenarios(brakings: str, tmp_p
     undecided = rare_envs.risk("idm", **few, max_rate=1e5)
     low, high = undecided.total.interval_per_million_km
     assert low < 1e5 < high and undecided.verdict.decision == "undecided" == undecided.to_dict()["gate"]["decision"]
-    assert "  limit        undecided: 100000 coll" in str(undecided) and "90 %: " in str(undecided).splitlines()[0]
+    assert "  limit        undecided: 100000 is between the" in str(undecided) and "90 %: " in str(undecided).splitlines()[0]
     assert judge_rate(1.001 * high, undecided.total, "").decision == "passes"
     words = [word for name, file in both.items() for word in ("--base", f"{name}={file}")]
     done = cli("risk", "idm", *words, "--method", "mc", "--max-sim", 300, "--max-rate", 0.999 * low)

@@ -31,9 +31,9 @@ BASE = BaseUncertainty(
 class Known:
     """An estimate that the gate looks at."""
 
-    def __init__(self, warnings: tuple[str, ...] = ()) -> None:
+    def __init__(self, warnings: tuple[str, ...] = (), sequence: tuple[float, float] | None = None) -> None:
         self.interval, self.confidence, self.warnings = (8e-5, 1.2e-4), 0.9, warnings
-        self.status, self.base_draws = samplers.Status.CONVERGED, 500
+        self.status, self.base_draws, self.sequence = samplers.Status.CONVERGED, 500, sequence
 
 
 @pytest.mark.parametrize(
@@ -59,12 +59,25 @@ def test_decisions(max_p: float, base: BaseUncertainty | None, given: bool, deci
     assert json.loads(json.dumps(verdict.to_dict()))["text"] == str(verdict)
 
 
-def test_a_warning_leaves_it_undecided() -> None:
+def test_a_warning_that_p_may_be_wrong_leaves_it_undecided() -> None:
     verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4, None)
-    assert verdict.decision == "undecided" and "weights are uneven" in str(verdict)
+    assert verdict.decision == "undecided" and "as a warning says that p may be wrong: weights are un" in str(verdict)
     doubtful = replace(BASE, warnings=("the spread is coarse.",))
     assert judge_estimate(Known(), 2e-3, doubtful).decision == "undecided"
-    assert judge_estimate(Known(), 2e-4, None).decision == "passes"
+    few = samplers.estimate(samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1), "mc", seed=0, max_sim=2000)
+    assert 0 < few.failures.total < 5 and "the estimate is coarse" in few.warnings[0]
+    assert few.meets(0.02).decision == "passes" and few.meets(1e-4).decision == "undecided"
+
+
+@pytest.mark.parametrize(
+    ("max_p", "base", "decision"),
+    [(1.3e-4, None, "undecided"), (1.5e-4, None, "passes"), (1.1e-3, BASE, "undecided"), (1.3e-3, BASE, "passes")],
+)
+def test_a_run_that_stopped_on_what_it_saw_is_judged_by_its_sequence(
+    max_p: float, base: BaseUncertainty | None, decision: str
+) -> None:
+    """1.4e-4 for 1.2e-4, and what an uncertain base leaves as much further out: 1.17e-3 for 1e-3."""
+    assert judge_estimate(Known(sequence=(7e-5, 1.4e-4)), max_p, base).decision == decision
 
 
 @pytest.mark.parametrize("max_p", [0.0, 1.0, -1.0, float("nan"), "low"])
