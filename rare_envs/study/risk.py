@@ -211,7 +211,7 @@ class Risk:
         beside += f"; uncalibrated in {missed}" if missed else ""
         lines = [
             f"{self.ego}: collisions per million km {per_km}{beside}",
-            *(f"  limit        {verdict}" for verdict in filter(None, [self.verdict])),
+            *([] if self.verdict is None else [f"  limit        {self.verdict}"]),
             *(f"  {line}" for line in text.tabulate_events(self.events)),
         ]
         if whole > 0:

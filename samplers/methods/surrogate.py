@@ -21,9 +21,6 @@ from samplers.importance import (
     Draws,
     Search,
     count_final_draws,
-    describe_low_ess,
-    heavy_draw_warnings,
-    weight_warnings,
     weighted_interval,
 )
 from samplers.method import Goal, Interrupted, Outcome, Steps
@@ -318,7 +315,7 @@ class SurrogateRun:
         return replace(outcome, draw_weights=draws.weights_after(0))
 
     def _outcome(self, draws: Draws, cov: float, largest_weight: float, status: Status) -> Outcome:
-        """Return what weighted draws say of p; that they are few is a remark here, as it is the rule."""
+        """Return what weighted draws say of p."""
         none, confidence = len(draws.f) == 0, self.goal.confidence
         if draws.ess < LEAST_ESS:
             interval = weighted_interval(draws, confidence, largest_weight, cov)
@@ -331,8 +328,6 @@ class SurrogateRun:
             interval=interval,
             cov=cov,
             status=Status.NO_HITS if status is Status.CONVERGED and none else status,
-            warnings=tuple(weight_warnings(draws) if none else heavy_draw_warnings(draws)),
-            remarks=() if none else tuple(describe_low_ess(draws)),
         )
 
 

@@ -33,6 +33,19 @@ def test_to_dict_is_plain_json():
     assert data["failures"]["total"] == estimate.failures.total
 
 
+@pytest.mark.parametrize(("method", "target"), [("mc", 0.1), ("is", None), ("mc", None)])
+def test_a_run_that_stops_on_what_it_sees_has_ends_that_hold_at_every_look(method: str, target: float | None) -> None:
+    estimate = samplers.estimate(half_space(2, 2.0).problem, method, seed=0, max_sim=20_000, target_cov=target)
+    if (method, target) == ("mc", None):
+        assert estimate.sequence is None and "every look" not in str(estimate)
+        return
+    (low, high), (below, above) = estimate.interval, estimate.sequence
+    assert estimate.n_sim < 20_000 and below < low < high < above
+    assert f"at every look [{below:.3e}, {above:.3e}], as the run stopped on what it saw" in str(estimate)
+    assert estimate.to_dict()["sequence"] == [below, above]
+    assert (estimate.meets(0.99 * above).decision, estimate.meets(1.01 * above).decision) == ("undecided", "passes")
+
+
 def test_says_how_large_a_region_may_have_been_missed():
     estimate = estimate_adss()
     assert estimate.base_draws == 1000

@@ -66,7 +66,7 @@ def test_a_warning_that_p_may_be_wrong_leaves_it_undecided() -> None:
     assert judge_estimate(Known(), 2e-3, doubtful).decision == "undecided"
     few = samplers.estimate(samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1), "mc", seed=0, max_sim=2000)
     assert 0 < few.failures.total < 5 and "the estimate is coarse" in few.warnings[0]
-    assert few.meets(0.02).decision == "passes" and few.meets(1e-4).decision == "undecided"
+    assert few.meets(0.02).decision == "passes" and few.meets(1e-3).decision == "undecided"
 
 
 @pytest.mark.parametrize(
