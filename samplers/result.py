@@ -364,10 +364,11 @@ class Estimate(EstimateData, Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
-        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen given gain warnings remarks choice seed"
+        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen given gain remarks choice seed"
         uncertainty, points = self.base_uncertainty, self.failures
         data = {name: getattr(self, name) for name in plain.split()} | {
             "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),
+            "warnings": self.warnings,
             "final_draws": None if self.sample is None else self.sample.n_units,
             "parts": [part.to_dict() for part in self.parts],
             "status": str(self.status),

@@ -7,8 +7,8 @@ from scipy import stats
 from samplers.sample import (
     PRIOR_SHARE,
     add_unseen,
-    confidence_sequence,
     clopper_pearson,
+    confidence_sequence,
     correlation_factor,
     effective_sample_size,
     largest_weight_share,
