@@ -329,7 +329,7 @@ def _base_uncertainty(
     if p_a == 0 or p_b == 0:
         why = "one of the two never failed."
         return summarise_refits(_ratio(p_a, p_b), math.inf, either.confidence, fitted, NO_SUMS, reason=why)
-    sums = reweight_runs_to_refits(either, fitted.refits, problem.failing_parts)
+    sums = reweight_runs_to_refits(either, fitted.refits, lambda run: problem.failing_parts(require_sample(run).x))
     cov = factor * _error(totals[0] / p_a - totals[1] / p_b)
     n_sim = 0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim
     return summarise_refits(

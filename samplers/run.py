@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.reweight import check_refits
+from samplers.analysis.weighted import estimate_known
 from samplers.method import Answer, Choice, Goal, Outcome, Request, Stepping, TermsOffer, choose_method
 from samplers.problem import (
     ON_ERROR,
@@ -419,7 +420,7 @@ class Run:
         if outcome.parts:
             return find_low_end([replace(part, outcome=self._keep_known(part.outcome)) for part in outcome.parts]), high
         if outcome.counts is None:
-            return low * known, high
+            return estimate_known(outcome, self._goal.gamma, self._goal.confidence)[2] if outcome.p > 0 else low, high
         hits, n = outcome.counts
         return clopper_pearson(round(hits * known), n, self._goal.confidence)[0], high
 

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,7 @@ from samplers.analysis.reweight import (
 from samplers.analysis.weighted import (
     Reported,
     band_generator,
-    no_outcome_weight,
+    estimate_known,
     require_sample,
     simultaneous_level,
 )
@@ -140,21 +140,19 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
     """Return the uncertainty of p that the events leave, or None where the base distribution has no refits.
 
     p under each refit comes from the failing points of the run; where there is a further run under the mixture of the
-    refits, from those of the two that are worth more effective points under that refit. The lower end leaves out
-    points without an outcome where these only bound p (`on_error="bound"`).
+    refits, from those of the two that are worth more effective points under that refit. The lower end is that of the
+    failures with an outcome where the others only bound p (`on_error="bound"`).
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
         return None
-    sums, low_factor, reason = NO_SUMS, 1.0, ""
+    sums, reason = NO_SUMS, ""
     try:
-        sums, sample = reweight_runs_to_refits(estimate, fitted.refits), require_sample(estimate)
-        failing = float(sample.weights[sample.f <= estimate.gamma].sum())
-        low_factor = 1 - no_outcome_weight(estimate, sample) / failing
+        sums = reweight_runs_to_refits(estimate, fitted.refits)
     except ValueError as error:
         reason = str(error)
     further = estimate.ensemble_run
-    return summarise_refits(
+    found = summarise_refits(
         estimate.p,
         estimate.cov,
         estimate.confidence,
@@ -162,11 +160,24 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
         sums,
         sampling=estimate.interval,
         lineages=read_lineages(estimate),
-        low_factor=low_factor,
         n_sim=0 if further is None else further.n_sim,
         doubts=[] if further is None else [f"in the further run: {text}" for text in further.warnings],
         reason=reason,
     )
+    if found.interval is None or estimate.on_error != "bound" or estimate.no_outcome_share == 0:
+        return found
+    p, cov, _ = estimate_known(estimate, estimate.gamma, estimate.confidence)
+    known = None
+    if p > 0:
+        sums = reweight_runs_to_refits(estimate, fitted.refits, keep_known)
+        known = summarise_refits(p, cov, estimate.confidence, fitted, sums, sampling=estimate.interval).interval
+    return replace(found, interval=(0.0 if known is None else known[0], found.interval[1]))
+
+
+def keep_known(run: EstimateData) -> FloatArray:
+    """Return 1 for the failing points of a run that have an outcome, 0 for the others, shape (1, k)."""
+    sample = require_sample(run)
+    return np.isfinite(sample.f[sample.f <= run.gamma]).astype(np.float64)[None]
 
 
 def summarise_refits(
@@ -178,7 +189,6 @@ def summarise_refits(
     *,
     sampling: Interval | None = None,
     lineages: float = math.inf,
-    low_factor: float = 1.0,
     largest: float = 1.0,
     n_sim: int = 0,
     doubts: Sequence[str] = (),
@@ -199,7 +209,7 @@ def summarise_refits(
     if not reason:
         families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
         ends = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
-        low, high = low_factor * _exp(ends[0]), _exp(ends[1])
+        low, high = _exp(ends[0]), _exp(ends[1])
         high = high if is_ratio else min(largest, high)
         if sampling is not None:
             low, high = min(low, sampling[0]), max(high, sampling[1])

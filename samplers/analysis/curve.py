@@ -1,7 +1,7 @@
 """Curve: P[f(X) <= g] over thresholds g from one run, with a simultaneous band."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,6 +12,7 @@ from samplers.analysis.weighted import (
     MIN_UNITS,
     add_unresolved,
     cov_inflation,
+    leave_out_lost,
     no_outcome_weight,
     require_sample,
     simultaneous_intervals,
@@ -152,7 +153,7 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     cov = np.where(sums.is_count, 1.0, inflation) * sums.cov
     low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
     if lost := no_outcome_weight(estimate, sample):
-        known = unit_sums(replace(sample, f=np.where(np.isneginf(sample.f), np.inf, sample.f)), grid)
+        known = unit_sums(leave_out_lost(sample), grid)
         p_known = p * (1 - lost / np.maximum(sums.p, lost))
         seen = use[p_known[use] > 0]
         low, _ = simultaneous_intervals(known, seen, p_known, inflation * known.cov, estimate.confidence, estimate.seed)

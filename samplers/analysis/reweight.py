@@ -355,18 +355,15 @@ def _sum_logarithms(log_terms: FloatArray, units: NDArray[np.intp]) -> tuple[flo
 
 
 def reweight_runs_to_refits(
-    estimate: EstimateData, refits: Sequence[Any], split: Callable[[FloatArray], FloatArray] | None = None
+    estimate: EstimateData, refits: Sequence[Any], split: Callable[[EstimateData], FloatArray] | None = None
 ) -> RefitSums:
     """Return p under each refit from the run or its further run, whichever has more effective points under that refit.
 
     The mixture of the refits has its failing points where the refits with the largest p have theirs: the others may
-    rest on fewer points than in the first run. `split` gives the parts of p at points, as in `reweight_to_refits`.
+    rest on fewer points than in the first run. `split` gives the parts of p in a run, as in `reweight_to_refits`.
     """
     runs = [each for each in (estimate, estimate.ensemble_run) if each is not None and each.p > 0 and each.sample]
-    found = [
-        reweight_to_refits(run, refits, None if split is None else split(require_sample(run).x))
-        for run in runs or [estimate]
-    ]
+    found = [reweight_to_refits(run, refits, None if split is None else split(run)) for run in runs or [estimate]]
     return choose_better_run(found, [sums.ess.min(axis=0, keepdims=True) for sums in found])
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
-from samplers.method import EstimateData, Part
+from samplers.method import EstimateData, Outcome, Part
 from samplers.output import to_json_value
 from samplers.problem import FloatArray
 from samplers.sample import (
@@ -67,7 +67,7 @@ def require_sample(estimate: EstimateData) -> Sample:
     return estimate.sample
 
 
-def cov_inflation(estimate: EstimateData, own_cov: float) -> float:
+def cov_inflation(estimate: Outcome, own_cov: float) -> float:
     """Return the factor max(1, c.o.v. of the estimate / c.o.v. of its units at gamma); 1 where either is not known."""
     if not math.isfinite(estimate.cov) or not 0 < own_cov < math.inf:
         return 1.0
@@ -209,6 +209,29 @@ def has_independent_points(sample: Sample) -> bool:
     """Return whether every point of a sample is a unit of its own (a draw, no chain)."""
     # of millions of draws np.unique takes a second
     return not sample.layers and bool((np.bincount(sample.units) <= 1).all())
+
+
+def leave_out_lost(sample: Sample) -> Sample:
+    """Return a sample whose points without an outcome do not fail."""
+    known = [replace(each, f=np.where(np.isneginf(each.f), np.inf, each.f)) for each in sample.layers]
+    return replace(sample, f=np.where(np.isneginf(sample.f), np.inf, sample.f), layers=tuple(known))
+
+
+def estimate_known(found: Outcome, gamma: float, confidence: float) -> tuple[float, float, float]:
+    """Return p > 0 of the failures that have an outcome, its c.o.v. and the lower end, from these points alone.
+
+    Without weighted points all three are those of p, in proportion.
+    """
+    if found.sample is None:
+        known = 1 - found.no_outcome_share
+        return found.p * known, found.cov, found.interval[0] * known
+    grid = np.array([gamma])
+    whole, sums = (unit_sums(each, grid) for each in (found.sample, leave_out_lost(found.sample)))
+    p, cov = found.p * float(sums.p[0] / whole.p[0]), cov_inflation(found, float(whole.cov[0])) * float(sums.cov[0])
+    if p == 0:
+        return 0.0, math.inf, 0.0
+    low = interval_of_sum(p, cov, float(sums.ess[0]), sums.independent, confidence)[0]
+    return p, cov, min(low, found.interval[0])
 
 
 def interval_of_sum(p: float, cov: float, ess: float, independent: bool, confidence: float) -> Interval:

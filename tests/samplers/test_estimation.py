@@ -88,7 +88,7 @@ def test_nan_as_failure_or_bound(method):
     assert counted.interval[0] > 0.1
     assert bound.p == counted.p
     assert bound.interval[1] == counted.interval[1]
-    assert bound.interval[0] == pytest.approx(certain, rel=0.35)
+    assert 0.5 * certain < bound.interval[0] < certain
     assert any("gave no outcome" in text for text in bound.warnings)
     assert np.isnan(bound.failures.f).any()
 
