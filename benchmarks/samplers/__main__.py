@@ -1,45 +1,57 @@
-"""Does a method that estimates P[f <= 0] do what it claims?
+"""Does a method that estimates P[f <= 0] do what it claims, and which one does it best?
 
-    python -m benchmarks.samplers --method auto,mc,openturns-nais --set analytic,public --budget 300,1500 --runs 20
-    python -m benchmarks.samplers --method mine:wide_draws --set problems_fourth.py --out mine.json
+    python -m benchmarks.samplers                     # our methods beside OpenTURNS', a minute or two each
+    python -m benchmarks.samplers --method auto,mine:wide_draws --set fourth,mine.py --budget 300,1500 --out mine.json
 
-runs methods many times on problems with known probabilities, counts every simulation itself, and prints a table for
-each method and budget, its worst problems first; there is no ranking by one number.
+runs methods many times on problems with known probabilities and counts every simulation itself. For each budget it
+prints a row for each method, then a row for each problem, the worst for the first method first, with the methods' gains
+side by side, coverage in brackets, and **bold** where a method's gain is more than twice that of the first. --detail
+adds a table for each method.
 
+- gain: variance of plain Monte Carlo at as many simulations, over the mean square error;
+- coverage: runs whose 95 % interval holds p, with the interval that so many runs allow (Clopper and Pearson);
+- low : high: runs whose interval is wholly below p, the unsafe side, and wholly above;
+- wrong: off by more than 4 own standard errors, or the interval misses p; right: all others; how many of each warn;
 - mean / p: mean of the estimates over the known probability, with its standard error;
 - c.o.v.: spread of the estimates over their mean, and in brackets what the runs state;
 - error / own: root mean square of a run's error over the standard error that it states;
-- gain: variance of plain Monte Carlo at as many simulations, over the mean square error;
-- coverage: runs whose 95 % interval holds p, with the interval that so many runs allow (Clopper and Pearson);
-- low : high: runs whose interval is wholly below p, the unsafe side, and wholly above; U / L: ratio of its ends;
-- time: processor time of a run without f (own time: --set speed --budget 6000);
+- time: processor time of a run without f (own time: --set speed);
 - faults: what the number of runs cannot explain.
 
 With --keep each run is a line of a file; those already there are not made again, so that seeds may be added later.
 """
 
 import argparse
+import importlib.util
 import json
 import math
-import statistics
 import sys
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+
+from scipy import stats
 
 import rare_envs
+from benchmarks.results_page import format_table
 from benchmarks.run_lines import RunLines
+from benchmarks.samplers.other_libraries import OTHER_SOLVERS
 from benchmarks.samplers.problems import GROUPS, find_problem, list_problems
 from benchmarks.samplers.runs import Job, MethodRun, about, find_method, map_jobs, run_once
-from benchmarks.samplers.summary import Cell, Power, cells_of, find_faults, power_of
+from benchmarks.samplers.summary import Cell, Summary, cells_of, summarise
 from samplers.output import to_json_value
-from samplers.sample import clopper_pearson
 
-COLUMNS = (
-    *("problem", "d", "p", "mean / p", "c.o.v. (own)", "error / own", "gain", "coverage %", "low : high", "U / L"),
-    *("warned %", "simulations", "calls", "time [ms]", "faults"),
+OURS = ("auto", "two-stage", "ice", "adss", "mc")
+BETTER = 2.0
+"""Times the gain of the first method from which on another's is printed bold."""
+HEADS = ("method", "problems", "coverage", "low : high", "gain", "wrong: warned", "right: warned", "time [ms]")
+DETAILS = (
+    *("problem", "d", "p", "mean / p", "c.o.v. (own)", "error / own", "gain", "coverage", "low : high", "U / L"),
+    *("right: warned", "simulations", "calls", "time [ms]"),
 )
 
 
@@ -48,16 +60,18 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     parser = argparse.ArgumentParser(
         "python -m benchmarks.samplers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--method", default="auto,mc,adss", help="names, openturns-*, uqpy-ss or module:attribute")
-    parser.add_argument("--set", default="analytic,public", help=f"{', '.join(GROUPS)}, or files")
+    others = OTHER_SOLVERS if importlib.util.find_spec("openturns") else ()
+    parser.add_argument("--method", default=",".join([*OURS, *others]), help="names, or module:attribute")
+    parser.add_argument("--set", default="visible,fourth", help=f"{', '.join(GROUPS)}, or files")
     parser.add_argument("--problems", default="", help="by name instead of sets")
-    parser.add_argument("--budget", default="300,1500,6000", help="simulations of a run")
-    parser.add_argument("--runs", type=int, default=20, help="of each method on each problem")
+    parser.add_argument("--budget", default="6000", help="simulations of a run")
+    parser.add_argument("--runs", type=int, default=10, help="of each method on each problem")
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--rotation", type=int, help="seed of another rotation of the input spaces")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--keep", type=Path, help="file of all runs, one line each")
     parser.add_argument("--out", type=Path, help="JSON file of the figures")
+    parser.add_argument("--detail", action="store_true", help="a table for each method as well")
     sys.path.insert(0, "")
     options = parser.parse_args(arguments)
     try:
@@ -89,19 +103,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
             jobs, partial(map_jobs, run_once, workers=options.workers), progress=True
         )
     cells = cells_of(runs)
-    groups = {(cell.method, cell.max_sim): [] for cell in cells}
-    for cell in cells:
-        groups[cell.method, cell.max_sim].append(cell)
-    for (method, budget), own in groups.items():
-        power = power_of([run for run in runs if (run.method, run.max_sim) == (method, budget)])
-        print("\n".join([f"## {method}, {budget:,} simulations", "", *describe_group(own, power), ""]))
+    for budget in options.budgets:
+        groups = [[c for c in cells if (c.method, c.max_sim) == (method, budget)] for method in options.methods]
+        print("\n".join([f"## {budget:,} simulations, {options.runs} runs", "", *compare(groups), ""]))
+        if options.detail:
+            for group in groups:
+                print(f"### {group[0].method}, {budget:,} simulations\n\n{describe(group)}\n")
     if options.out:
-        names = {"methods": options.methods, "budgets": options.budgets, "runs": options.runs, "seed": options.seed}
+        words = sys.argv[1:] if arguments is None else arguments
         content = {
-            "about": about(command="python -m benchmarks.samplers", **names),
-            "rows": [{**asdict(cell), "faults": faults_of(cell)} for cell in cells],
+            "about": about(command=" ".join(["python -m benchmarks.samplers", *words])),
+            "summaries": summaries_of(cells),
+            "cells": [{**asdict(cell), "set": find_problem(cell.problem).group} for cell in cells],
         }
-        options.out.write_text(json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        options.out.write_text(json.dumps(to_json_value(content), allow_nan=False) + "\n", encoding="utf-8")
 
 
 def lines_of(file: Path, rotation: int | None) -> RunLines[Job, MethodRun]:
@@ -120,53 +135,71 @@ def _key_of(run: Job | MethodRun) -> tuple[str, str, int, int | None]:
     return run.method, run.problem, run.seed, run.max_sim
 
 
-def faults_of(cell: Cell) -> tuple[str, ...]:
-    """Return the faults of a cell; regions that no method can know of are none."""
-    return find_faults(cell, find_problem(cell.problem).knowable)
+def compare(groups: Sequence[Sequence[Cell]]) -> Iterator[str]:
+    """Yield the table of the methods, that of their gains side by side, and their faults.
+
+    Args:
+        groups: The cells of each method, on the same problems in the same order.
+    """
+    first, runs = groups[0][0].method, groups[0][0].runs
+    yield format_table(HEADS, (_summary_row(summarise(group)) for group in groups))
+    yield f"\nGain (coverage in %), **bold** beyond {BETTER:g} times {first}'s, {chance_of_bold(runs):.0%} by chance.\n"
+    rows = sorted(zip(*groups, strict=True), key=lambda cells: _worst_first(cells[0]))
+    yield format_table(
+        ("problem", "d", "p", *(group[0].method for group in groups)),
+        ((cells[0].problem, f"{cells[0].dim}", f"{cells[0].p:.2g}", *_gains_of(cells)) for cells in rows),
+    )
+    yield ""
+    yield from (f"- {c.method}, {c.problem}: {'; '.join(c.faults)}" for group in groups for c in group if c.faults)
 
 
-def describe_group(cells: Sequence[Cell], power: Power) -> list[str]:
-    """Return what holds of a method at a budget over all its problems, and the table of them, the worst first."""
-    counted = [cell for cell in cells if cell.p > 0 and find_problem(cell.problem).knowable]
-    runs = sum(cell.runs for cell in counted)
-    held = sum(round(cell.coverage * cell.runs) for cell in counted)
-    low, high = sum(cell.low for cell in counted), sum(cell.high for cell in counted)
-    gains = [cell.gain for cell in counted if math.isfinite(cell.gain)]
-    gain = statistics.geometric_mean(gains) if gains else math.nan
-    return [
-        f"- Intervals hold p in {_share(held, runs)}; {low} lie below it, {high} above. "
-        f"Geometric mean of the gains: {gain:.3g}.",
-        f"- Warned of runs off by more than 4 own standard errors: {_share(power.wrong_warned, power.wrong)}; "
-        f"within 2: {_share(power.right_warned, power.right)}.",
-        "",
-        f"| {' | '.join(COLUMNS)} |",
-        "|---" * len(COLUMNS) + "|",
-        *(_describe_cell(cell) for cell in sorted(cells, key=_worst_first)),
-    ]
+def chance_of_bold(runs: int) -> float:
+    """Return how often one of two equal methods looks that much better, were errors Gaussian."""
+    return float(stats.f.sf(BETTER, runs, runs))
+
+
+def describe(cells: Sequence[Cell]) -> str:
+    """Return the table of one method, the worst problem first."""
+    return format_table(DETAILS, (_detail_row(cell) for cell in sorted(cells, key=_worst_first)))
+
+
+def summaries_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Return the summaries by budget, method and set, and those of all sets together."""
+    groups: dict[tuple[int | None, str, str], list[Cell]] = defaultdict(list)
+    for cell in cells:
+        for name in (find_problem(cell.problem).group, "all"):
+            groups[cell.max_sim, cell.method, name].append(cell)
+    return [{"set": key[2], **asdict(summarise(group))} for key, group in groups.items()]
 
 
 def _worst_first(cell: Cell) -> tuple[float, ...]:
-    return -len(faults_of(cell)), cell.coverage, cell.gain if math.isfinite(cell.gain) else math.inf
+    return cell.covered.count / cell.covered.of, cell.gain if math.isfinite(cell.gain) else math.inf
 
 
-def _describe_cell(cell: Cell) -> str:
-    low, high = cell.coverage_interval
-    values = [
+def _summary_row(row: Summary) -> Sequence[str]:
+    gain = f"{row.gain:,.3g}" + (f" on {row.gains}" if row.gains < row.problems else "")
+    return (
+        *(row.method, f"{row.problems}", f"{row.covered}", f"{row.low} : {row.high}", gain),
+        *(f"{row.wrong_warned}", f"{row.right_warned}", f"{1e3 * row.seconds:,.0f}"),
+    )
+
+
+def _gains_of(cells: Sequence[Cell]) -> Iterator[str]:
+    """Yield the gain of each method on a problem, bold where it is far better than the first."""
+    for cell in cells:
+        mark = "**" if cell.gain > BETTER * cells[0].gain else ""
+        gain = f"{cell.gain:,.3g}" if math.isfinite(cell.gain) else "-"
+        yield f"{mark}{gain}{mark} ({100 * cell.covered.count / cell.covered.of:.0f})"
+
+
+def _detail_row(cell: Cell) -> Sequence[str]:
+    values = (
         *(cell.problem, f"{cell.dim}", f"{cell.p:.3g}", f"{cell.mean:.3f} ± {cell.mean_se:.3f}"),
         *(f"{cell.cov:.3f} ({cell.own_cov:.3f})", f"{cell.error_over_own:.2f}", f"{cell.gain:,.3g}"),
-        *(f"{100 * cell.coverage:.0f} ({100 * low:.0f} to {100 * high:.0f})", f"{cell.low} : {cell.high}"),
-        *(f"{cell.upper_over_lower:.2f}", f"{100 * cell.warned:.0f}", f"{cell.n_sim:,.0f}", f"{cell.calls:.0f}"),
-        *(f"{1e3 * cell.seconds:,.0f}", "; ".join(faults_of(cell)).replace("|", "/")),
-    ]
-    return f"| {' | '.join(values)} |".replace("nan", "-")
-
-
-def _share(number: int, of: int) -> str:
-    """Return a share with its 95 % interval in words."""
-    if of == 0:
-        return "0 of 0"
-    low, high = clopper_pearson(number, of, 0.95)
-    return f"{number} of {of} ({100 * number / of:.1f} %; {100 * low:.1f} to {100 * high:.1f})"
+        *(f"{cell.covered}", f"{cell.low} : {cell.high}", f"{cell.upper_over_lower:.2f}"),
+        *(f"{cell.right_warned}", f"{cell.n_sim:,.0f}", f"{cell.calls:.0f}", f"{1e3 * cell.seconds:,.0f}"),
+    )
+    return [value.replace("nan", "-") for value in values]
 
 
 def _split(names: str) -> list[str]:

@@ -1,9 +1,9 @@
 """Kinds of limit states with known P[f(U) <= 0], U ~ N(0, I), as a benchmark needs them.
 
-More than `samplers.limit_states`, which it builds on: several regions in many dimensions, noise, jumps, ties, islands,
-intersections, dozens of regions, hundreds of dimensions without a direction that matters. All are written along the
-axes; N(0, I) is the same in every direction, so any rotation of them has the same p. `problems.py` has the parameters;
-the probabilities are closed forms or one-dimensional integrals, but for the random networks.
+More than `samplers.limit_states`, which it builds on: several regions in many dimensions, noise, jumps, islands,
+intersections, dozens of regions. All are written along the axes; N(0, I) is the same in every direction, so any
+rotation of them has the same p. `problems.py` has the parameters; the probabilities are closed forms or one-dimensional
+integrals.
 """
 
 import functools
@@ -19,11 +19,10 @@ from scipy.stats import chi2, ncx2
 from samplers.limit_states import Reference, integrate, normal_cdf, normal_mean
 from samplers.problem import FloatArray, FunctionProblem
 
+Seed = int | tuple[int, ...]
 PointFunction = Callable[[FloatArray], FloatArray]
-HIDDEN, OUTPUTS = 50, 10
-"""Units of a random network's layer, and its outputs."""
-NETWORKS = {30: (3.5, 3.0200e-4, 2.7e-6), 400: (3.3, 2.5473e-4, 2.5e-6)}
-"""Inputs to limit, p and its standard error, by 4e7 plain draws."""
+Noise = Callable[[np.random.Generator, int], FloatArray]
+"""What n evaluations add to f, shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,10 @@ class LimitState:
     p: float
     standard_error: float = 0.0
     """Of p; 0 where p is exact."""
-    noise: float = 0.0
-    """Standard deviation of the Gaussian noise that every evaluation adds to f."""
+    noise: Noise | None = None
+    """Noise that every evaluation adds to f."""
 
-    def problem(self, rotation: int | None = None, noise_seed: int = 0) -> FunctionProblem:
+    def problem(self, rotation: Seed | None = None, noise_seed: int = 0) -> FunctionProblem:
         """Return the problem for a sampler.
 
         Args:
@@ -51,7 +50,7 @@ class LimitState:
 
 
 @functools.lru_cache(maxsize=8)
-def random_rotation(dim: int, seed: int | tuple[int, ...]) -> FloatArray:
+def random_rotation(dim: int, seed: Seed) -> FloatArray:
     """Return a random orthogonal matrix, uniform over all (QR with the signs of R made positive)."""
     q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, dim)))
     rotation: FloatArray = q * np.sign(np.diag(r))
@@ -77,7 +76,7 @@ def half_spaces(dim: int, betas: Sequence[float], slopes: Sequence[float] = (), 
     if not noise:
         return LimitState(f, dim, any_of(*ndtr(-beta)))
     p = normal_mean(lambda z: any_of(*ndtr(-beta - noise * z)))
-    return LimitState(f, dim, p, noise=noise)
+    return LimitState(f, dim, p, noise=gaussian_noise(noise))
 
 
 def opposite(dim: int, ahead: float, behind: float, slopes: tuple[float, float] = (1.0, 1.0)) -> LimitState:
@@ -91,26 +90,6 @@ def opposite(dim: int, ahead: float, behind: float, slopes: tuple[float, float] 
         return np.minimum(slopes[0] * (ahead - u[:, 0]), slopes[1] * (behind + u[:, 0]))
 
     return LimitState(f, dim, normal_cdf(-ahead) + normal_cdf(-behind))
-
-
-def round_to_steps(smooth: LimitState, step: float = 0.5, cap: float = 3.0) -> LimitState:
-    """Round f up to whole steps and cap it, as a recorded time to collision may be: ties everywhere, the same p."""
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.minimum(step * np.ceil(smooth.f(u) / step), cap)
-
-    return LimitState(f, smooth.dim, smooth.p)
-
-
-def bowl(dim: int, beta: float, curvature: float) -> LimitState:
-    """One design point, the boundary curving away in all directions: f = beta + curvature sum_{k>1} u_k^2 - u_1."""
-
-    def f(u: FloatArray) -> FloatArray:
-        return np.asarray(beta + curvature * np.sum(u[:, 1:] ** 2, axis=1) - u[:, 0])
-
-    radius = chi2(dim - 1)
-    low, high = radius.ppf(1e-15), radius.isf(1e-15)
-    return LimitState(f, dim, integrate(lambda q: radius.pdf(q) * normal_cdf(-beta - curvature * q), low, high))
 
 
 def concave(beta: float = 5.0, curvature: float = 0.5, shift: float = 0.1) -> LimitState:
@@ -208,29 +187,27 @@ def squares(dim: int, power: float, limit: float) -> LimitState:
     return LimitState(lambda u: limit - u**2 @ weights, dim, p)
 
 
-def network(dim: int) -> LimitState:
-    """A random network of one layer: f = limit - max |tanh(2 u W) V|, W and V Gaussian of variance 1 / inputs."""
-    first, second = network_weights(dim)
-    limit, p, error = NETWORKS[dim]
-    return LimitState(lambda u: limit - np.abs(np.tanh(2.0 * u @ first) @ second).max(axis=1), dim, p, error)
-
-
-def network_weights(dim: int) -> tuple[FloatArray, FloatArray]:
-    """Return the weights of a random network's two layers, (dim, units) and (units, outputs)."""
-    rng = np.random.default_rng(3)
-    first = rng.standard_normal((dim, HIDDEN)) / math.sqrt(dim)
-    return first, rng.standard_normal((HIDDEN, OUTPUTS)) / math.sqrt(HIDDEN)
-
-
 def _rotated(f: PointFunction, rotation: FloatArray) -> PointFunction:
     return lambda u: f(u @ rotation)
 
 
-def _noisy(f: PointFunction, sd: float, seed: int) -> PointFunction:
+def gaussian_noise(sd: float) -> Noise:
+    """Return noise from N(0, sd^2)."""
+    return lambda rng, n: sd * rng.standard_normal(n)
+
+
+def _noisy(f: PointFunction, noise: Noise, seed: int) -> PointFunction:
     rng = np.random.default_rng([seed, 777])
-    return lambda u: f(u) + sd * rng.standard_normal(len(u))
+    return lambda u: f(u) + noise(rng, len(u))
 
 
 def any_of(*p: float) -> float:
     """Return the probability of any of several independent events, without cancellation."""
     return -math.expm1(float(np.log1p(-np.array(p)).sum()))
+
+
+def bowl_probability(beta: float, curvature: float, k: int) -> float:
+    """Return P[u_0 > beta + curvature (u_1^2 + ... + u_k^2)]; curvature < 0 bends it towards the origin."""
+    radius = chi2(k)
+    low, high = radius.ppf(1e-18), radius.isf(1e-18)
+    return integrate(lambda q: radius.pdf(q) * normal_cdf(-beta - curvature * q), low, high, 1.0, 5.0, 20.0, 60.0)

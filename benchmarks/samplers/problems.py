@@ -8,26 +8,24 @@ from functools import cache, partial
 from pathlib import Path
 
 from benchmarks import RESULTS
-from benchmarks.samplers.fresh_states import BLIND, HELD_OUT
+from benchmarks.samplers.fourth_states import FOURTH
 from benchmarks.samplers.limit_states import (
     LimitState,
+    Seed,
     as_limit_state,
-    bowl,
     concave,
     corner,
     half_spaces,
     hidden_box,
     islands,
-    network,
     never,
     opposite,
     ring_part,
-    round_to_steps,
     slabs,
     squares,
     strip,
 )
-from benchmarks.samplers.public_states import PUBLIC_STATES
+from benchmarks.samplers.visible_states import VISIBLE
 from samplers.limit_states import Reference, four_branches, half_space, parabola, plateau, shell
 
 
@@ -37,8 +35,8 @@ class BenchmarkProblem:
 
     make: Callable[[], LimitState]
     group: str
-    """The set that it is of: one of `GROUPS` ("highdim": 30 dimensions and more), or a file."""
-    rotation: int | None = None
+    """The set that it is of: one of `GROUPS`, or a file."""
+    rotation: Seed | None = None
     """Seed of the rotation of its input space, unless another one is asked for."""
     knowable: bool = True
     """False where no method can know of a region of failure: it then counts in no coverage."""
@@ -60,62 +58,50 @@ def _collide(env_id: str, base: str) -> LimitState:
     )
 
 
-_analytic = partial(BenchmarkProblem, group="analytic")
-_highdim = partial(BenchmarkProblem, group="highdim")
+_visible = partial(BenchmarkProblem, group="visible")
 _driving = partial(BenchmarkProblem, group="driving")
-
 PROBLEMS: dict[str, BenchmarkProblem] = {
-    # for the time that methods take for themselves
-    "lin_d6": BenchmarkProblem(_reference_state(half_space, 6), "speed"),
-    "lin_d428": BenchmarkProblem(_reference_state(half_space, 428), "speed"),
     # one region
-    "lin_d2": _analytic(_reference_state(half_space, 2)),
-    "lin_d100": _highdim(_reference_state(half_space, 100)),
-    "lin_d500": _highdim(_reference_state(half_space, 500)),
-    "convex_d2": _analytic(_reference_state(parabola), rotation=5),
-    "curved_d20": _analytic(partial(bowl, 20, 2.6, 0.05), rotation=6),
-    "sphere_d20": _analytic(_reference_state(shell, 20, 1e-4)),
-    "island_d3": _analytic(partial(islands, [(2.5, 2.0, 0.0)], [0.35])),
-    "corner_d5": _analytic(partial(corner, 5, (1.6, 1.5, 1.2))),
-    "ringpart_d10": _analytic(ring_part),
-    "strip_d4": _analytic(strip),
-    "plateau_d3": _analytic(_reference_state(plateau)),
+    "lin_d2": _visible(_reference_state(half_space, 2)),
+    "lin_d100": _visible(_reference_state(half_space, 100)),
+    "lin_d500": _visible(_reference_state(half_space, 500)),
+    "convex_d2": _visible(_reference_state(parabola), rotation=5),
+    "sphere_d20": _visible(_reference_state(shell, 20, 1e-4)),
+    "island_d3": _visible(partial(islands, [(2.5, 2.0, 0.0)], [0.35])),
+    "corner_d5": _visible(partial(corner, 5, (1.6, 1.5, 1.2))),
+    "ringpart_d10": _visible(ring_part),
+    "strip_d4": _visible(strip),
+    "plateau_d3": _visible(_reference_state(plateau)),
     # several regions
-    "concave_d2": _analytic(concave),
-    "branch4_d2": _analytic(_reference_state(four_branches)),
-    "islands_d3": _analytic(partial(islands, [(2.4, 1.8, 0.0), (-2.2, 0.0, -2.2)], [0.4, 0.5])),
-    "common_d4": _analytic(partial(half_spaces, 4, (2.0, 2.1))),
-    "three_d6": _analytic(partial(half_spaces, 6, (3.5, 3.7, 3.9), (1.0, 3.0, 0.4)), rotation=8),
-    "rare_d6": _analytic(partial(half_spaces, 6, (5.0, 5.2)), rotation=9),
-    "steps_d6": _analytic(lambda: round_to_steps(half_spaces(6, (3.5, 4.0))), rotation=10),
-    "six_d8": _analytic(partial(half_spaces, 8, (3.5, 3.6, 3.6, 3.7, 3.8, 3.9), (1, 3, 0.4, 1, 0.3, 2)), rotation=4),
-    "two_d10": _analytic(partial(opposite, 10, 3.5, 4.0)),
-    "two_d30": _highdim(partial(half_spaces, 30, (3.4, 3.8)), rotation=1),
-    "two_d60": _highdim(partial(half_spaces, 60, (3.4, 3.6)), rotation=2),
-    "four_d100": _highdim(partial(half_spaces, 100, (3.5, 3.6, 3.7, 3.8)), rotation=3),
+    "concave_d2": _visible(concave),
+    "branch4_d2": _visible(_reference_state(four_branches)),
+    "islands_d3": _visible(partial(islands, [(2.4, 1.8, 0.0), (-2.2, 0.0, -2.2)], [0.4, 0.5])),
+    "common_d4": _visible(partial(half_spaces, 4, (2.0, 2.1))),
+    "rare_d6": _visible(partial(half_spaces, 6, (5.0, 5.2)), rotation=9),
+    "six_d8": _visible(partial(half_spaces, 8, (3.5, 3.6, 3.6, 3.7, 3.8, 3.9), (1, 3, 0.4, 1, 0.3, 2)), rotation=4),
+    "two_d10": _visible(partial(opposite, 10, 3.5, 4.0)),
+    "two_d30": _visible(partial(half_spaces, 30, (3.4, 3.8)), rotation=1),
+    "two_d60": _visible(partial(half_spaces, 60, (3.4, 3.6)), rotation=2),
+    "four_d100": _visible(partial(half_spaces, 100, (3.5, 3.6, 3.7, 3.8)), rotation=3),
     # f leads away from the likelier region, or says nothing of it
-    "deceptive_d2": _analytic(partial(opposite, 2, 5.0, 3.5, (0.5, 10.0))),
-    "decep_d8": _analytic(partial(half_spaces, 8, (4.9, 3.5), (0.5, 10.0)), rotation=4),
-    "decep_box_d3": _analytic(hidden_box, knowable=False),
-    "never_d4": _analytic(never),
-    # no proposal is to be found: dozens of regions, hundreds of dimensions without a direction
-    "slabs_d20": _analytic(partial(slabs, 20, 4.5)),
-    "slabs_d500": _highdim(partial(slabs, 500, 5.0)),
-    "squares_d50": _highdim(partial(squares, 50, 1.0, 17.0)),
-    "squares_d200": _highdim(partial(squares, 200, 0.5, 42.6)),
-    "network_d30": _highdim(partial(network, 30)),
-    "network_d400": _highdim(partial(network, 400)),
-    # every evaluation adds fresh noise; no proposal in u can gain more than 413 and 35
-    "noisy_d6": _analytic(partial(half_spaces, 6, (3.5,), noise=0.3), rotation=11),
-    "noise2_d4": _analytic(partial(half_spaces, 4, (4.0, 4.2), noise=0.6), rotation=12),
-    # scenarios
+    "deceptive_d2": _visible(partial(opposite, 2, 5.0, 3.5, (0.5, 10.0))),
+    "decep_d8": _visible(partial(half_spaces, 8, (4.9, 3.5), (0.5, 10.0)), rotation=4),
+    "decep_box_d3": _visible(hidden_box, knowable=False),
+    "never_d4": _visible(never),
+    # every evaluation adds fresh noise; no proposal in u can gain more than 413
+    "noisy_d6": _visible(partial(half_spaces, 6, (3.5,), noise=0.3), rotation=11),
+    **{name: _visible(make, rotation=seed and (20261122, seed)) for name, (make, seed) in VISIBLE.items()},
+    **{name: BenchmarkProblem(make, "fourth", seed and (4, 1912, seed)) for name, (make, seed) in FOURTH.items()},
     "following_us101_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "us101-gap")),
     "following_highway_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "highway")),
     "cut_in_us101_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "us101-15-offsets")),
     "cut_in_highway_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "highway")),
-    **{name: BenchmarkProblem(partial(getattr, public, "state"), "public") for name, public in PUBLIC_STATES.items()},
-    **{state.__name__: BenchmarkProblem(state, "blind") for state in BLIND},
-    **{state.__name__: BenchmarkProblem(state, "held-out") for state in HELD_OUT},
+    # dozens of regions or directions: no proposal is to be found
+    "slabs_d20": BenchmarkProblem(partial(slabs, 20, 4.5), "directionless"),
+    "squares_d50": BenchmarkProblem(partial(squares, 50, 1.0, 17.0), "directionless"),
+    # for the time that methods take for themselves
+    "lin_d6": BenchmarkProblem(_reference_state(half_space, 6), "speed"),
+    "lin_d428": BenchmarkProblem(_reference_state(half_space, 428), "speed"),
 }
 GROUPS = tuple(dict.fromkeys(problem.group for problem in PROBLEMS.values()))
 """Names of the sets."""

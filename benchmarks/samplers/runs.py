@@ -28,6 +28,8 @@ _Run = TypeVar("_Run")
 
 GUARD_FACTOR = 50
 """Times its budget that a method of somebody else may simulate before it is stopped."""
+GUARD_SECONDS = 15.0
+"""Processor time that it may take for a run, f included."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,6 @@ class Job:
     problem: str
     seed: int
     max_sim: int | None = None
-    replicates: int = 1
     rotation: int | None = None
     """Seed of the rotation of the input space; None for the problem's own."""
 
@@ -79,10 +80,12 @@ class Meter:
 
     Args:
         f: Maps points (n, d) to (n,).
-        limit: Points after which the next call raises `LimitReached`; None for no limit.
+        limit: Points after which the next call raises `LimitReached`, as it does after `GUARD_SECONDS`; None for no
+            limits.
     """
 
     def __init__(self, f: Callable[[FloatArray], FloatArray], limit: int | None = None) -> None:
+        self._start = time.process_time()
         self.calls, self.points, self.seconds = 0, 0, 0.0
         self.reached: LimitReached | None = None
         """What was raised at the limit; libraries in C++ pass on less of it."""
@@ -96,12 +99,16 @@ class Meter:
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Call f."""
-        if self._limit is not None and self.points + len(x) > self._limit:
-            self.reached = LimitReached(f"more than {self._limit:,} evaluations")
-            raise self.reached
+        start = time.process_time()
+        if self._limit is not None:
+            if self.points + len(x) > self._limit:
+                self.reached = LimitReached(f"more than {self._limit:,} evaluations")
+            elif start - self._start > GUARD_SECONDS:
+                self.reached = LimitReached(f"more than {GUARD_SECONDS:g} s")
+            if self.reached:
+                raise self.reached
         self.calls += 1
         self.points += len(x)
-        start = time.process_time()
         self._digest.update(np.ascontiguousarray(x).tobytes())
         values = self._f(x)
         self.seconds += time.process_time() - start
@@ -161,7 +168,7 @@ def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
         start = time.process_time()
         try:
             if isinstance(method, Stepping):
-                answer: Any = estimate(problem, method, seed=job.seed, max_sim=job.max_sim, replicates=job.replicates)
+                answer: Any = estimate(problem, method, seed=job.seed, max_sim=job.max_sim)
             else:
                 answer = method(problem, seed=job.seed, max_sim=job.max_sim)
             return read_answer(job, meter, time.process_time() - start, answer)

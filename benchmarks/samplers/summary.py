@@ -1,35 +1,54 @@
-"""Runs into figures: per method and problem, faults beyond chance, and whether warnings come with the wrong runs."""
+"""Runs into figures: per method and problem, and per method over all problems, with the binomial intervals."""
 
 import math
-import re
-from collections import Counter, defaultdict
+import statistics
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
-from scipy.special import ndtr, stdtrit
 
 from benchmarks.samplers.limit_states import LimitState
-from benchmarks.samplers.problems import limit_state
+from benchmarks.samplers.problems import find_problem, limit_state
 from benchmarks.samplers.runs import MethodRun
 from samplers.problem import FloatArray
+from samplers.sample import clopper_pearson
 
 LONGEST_EXAMPLE = 100
 """Letters of an error in a table."""
-BIAS_ERRORS = 4.0
-"""Standard errors that a mean of many runs may be off: by chance 1 of 16,000 unbiased means is further off."""
-LEAST_RUNS = 5
-"""With fewer bias is not judged: they may agree by chance, as plain draws with equal numbers of hits do."""
-NOTICED_BIAS = 0.02
-"""Bias below which nobody would mind, over p."""
-NOMINAL_COVERAGE = 0.95
+FAR = 4.0
+"""Own standard errors off, beyond which a run is wrong whatever its interval says."""
 CHANCE = 1e-3
 """Probability that a method of nominal coverage is called one that covers too little."""
-READ_DIGITS = 1e-10
-"""Relative error that no draws reach in every run."""
 BUDGET_EXCESS = 0.01
 """Share of the budget by which it may be exceeded."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """So many of so many."""
+
+    count: int
+    of: int
+    interval: tuple[float, float] = field(init=False)
+    """The 95 % interval of the probability (Clopper and Pearson 1934)."""
+
+    def __post_init__(self) -> None:
+        """Find the interval."""
+        interval = clopper_pearson(self.count, self.of, 0.95) if self.of else (0.0, 1.0)
+        object.__setattr__(self, "interval", interval)
+
+    def __add__(self, other: "Share") -> "Share":
+        """Pool two."""
+        return Share(self.count + other.count, self.of + other.of)
+
+    def __str__(self) -> str:
+        """Return the percentage with its interval."""
+        if not self.of:
+            return "0 of 0"
+        low, high = self.interval
+        return f"{100 * self.count / self.of:.1f} % of {self.of} ({100 * low:.1f} to {100 * high:.1f})"
 
 
 @dataclass(frozen=True)
@@ -40,9 +59,9 @@ class Cell:
     problem: str
     dim: int
     p: float
+    max_sim: int | None
+    """The budget; None for no limit."""
     runs: int
-    raised: int
-    """Runs that ended in an exception; they count as not covering and nowhere else."""
     mean: float
     """Of the estimates, over p."""
     mean_se: float
@@ -55,44 +74,46 @@ class Cell:
     """Root mean square of the errors over the run's own standard errors: 1 where these are right."""
     gain: float
     """(1 - p) / p / (n_sim x relative mean square error)."""
-    coverage: float
-    """Share of the intervals that hold p."""
-    low: int
-    """Intervals wholly below p: the unsafe side."""
-    high: int
-    """Intervals wholly above p."""
     upper_over_lower: float
     """Of the ends of the interval, the median."""
-    warned: float
-    worst: float
-    """Largest |estimate / p - 1|."""
     n_sim: float
     calls: float
     seconds: float
     """Processor time of one run without f."""
-    max_sim: int | None = None
-    """The budget; None for no limit."""
-    hidden: float = 0.0
-    """Share of the runs that state fewer simulations than were made."""
-    reference_error: float = 0.0
-    """Standard error of p itself, over p."""
-    overstated: float = 0.0
-    """Share of the runs that state more simulations than the problem was asked for."""
-    without_f: float = 0.0
-    """Share of the runs that answer without a single simulation."""
-    impossible: float = 0.0
-    """Share of the runs with a p or c.o.v. that cannot be, or an interval around another p; none of them covers."""
-    example: str = ""
-    """What the first run raised or, if none did, the first impossible answer."""
-    same_points: bool = False
-    """Whether all runs simulated the same points, whatever their seed."""
+    covered: Share
+    """Of all runs those whose interval holds p; a run that raised, or whose answer cannot be, does not."""
+    low: int
+    """Intervals wholly below p: the unsafe side."""
+    high: int
+    """Intervals wholly above p."""
+    far_warned: Share
+    """Of the runs off by more than `FAR` of their own standard errors."""
+    wrong_warned: Share
+    """Of the runs off by as much, or whose interval misses p."""
+    right_warned: Share
+    """Of the others; runs that raised are neither."""
+    faults: tuple[str, ...] = field(default=())
+    """What chance does not explain, in words."""
 
-    @property
-    def coverage_interval(self) -> tuple[float, float]:
-        """Return the 95 % interval of the coverage, of so many runs (Clopper and Pearson 1934)."""
-        held = round(self.coverage * self.runs)
-        found = stats.binomtest(held, self.runs).proportion_ci(0.95, method="exact")
-        return float(found.low), float(found.high)
+
+@dataclass(frozen=True)
+class Summary:
+    """One method at one budget, over all problems of which a method can know."""
+
+    method: str
+    max_sim: int | None
+    problems: int
+    covered: Share
+    low: int
+    high: int
+    gain: float
+    """Geometric mean over the problems on which runs ended."""
+    gains: int
+    """Number of these."""
+    far_warned: Share
+    wrong_warned: Share
+    right_warned: Share
+    seconds: float
 
 
 def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
@@ -100,76 +121,73 @@ def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
     groups: dict[tuple[str, str, int | None], list[MethodRun]] = defaultdict(list)
     for run in runs:
         groups[run.method, run.problem, run.max_sim].append(run)
-    return [cell_of(group, limit_state(group[0].problem)) for group in groups.values()]
+    return [
+        cell_of(group, limit_state(group[0].problem), find_problem(group[0].problem).knowable)
+        for group in groups.values()
+    ]
 
 
-def cell_of(runs: Sequence[MethodRun], state: LimitState) -> Cell:
-    """Summarise the runs of one method on one problem."""
+def cell_of(runs: Sequence[MethodRun], state: LimitState, knowable: bool = True) -> Cell:
+    """Summarise the runs of one method on one problem; coverage is no fault where a region is not `knowable`."""
     p = state.p
     ended = [run for run in runs if not run.error]
-    estimates = np.array([run.p for run in ended])
-    ratio = estimates / p if p > 0 else np.full(len(ended), math.nan)
-    cov = _spread(ratio) / _mean(ratio) if _mean(ratio) > 0 else math.nan
-    error = (ratio - 1.0) ** 2
-    n_sim = _mean([run.n_sim for run in runs])
+    ratio = np.array([run.p for run in ended]) / p if p > 0 else np.full(len(ended), math.nan)
+    error, n_sim = _mean((ratio - 1.0) ** 2), _mean([run.n_sim for run in runs])
     off = np.array([own_errors_off(run, p) for run in ended])
+    is_wrong = [away > FAR or not covers(run, p) for run, away in zip(ended, off, strict=True)]
+    warned = [bool(run.warnings) for run in ended]
+    covered = Share(sum(covers(run, p) and is_possible(run) for run in ended), len(runs))
     return Cell(
         method=runs[0].method,
         problem=runs[0].problem,
         dim=state.dim,
         p=p,
+        max_sim=runs[0].max_sim,
         runs=len(runs),
-        raised=len(runs) - len(ended),
         mean=_mean(ratio),
         mean_se=_spread(ratio) / math.sqrt(max(len(ended), 1)),
-        cov=cov,
+        cov=_spread(ratio) / _mean(ratio) if _mean(ratio) > 0 else math.nan,
         own_cov=_median([run.cov for run in ended if math.isfinite(run.cov)]),
         error_over_own=math.sqrt(_mean(off[np.isfinite(off)] ** 2)),
-        gain=(1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and n_sim > 0 and _mean(error) > 0 else math.nan,
-        coverage=sum(covers(run, p) and is_possible(run) for run in ended) / len(runs),
-        low=sum(run.high < p for run in ended),
-        high=sum(run.low > p for run in ended),
+        gain=(1.0 - p) / p / (n_sim * error) if p > 0 and n_sim > 0 and error > 0 else math.nan,
         upper_over_lower=_median([run.high / run.low if run.low > 0 else math.inf for run in ended]),
-        warned=_mean([bool(run.warnings) for run in ended]),
-        worst=float(np.max(np.abs(ratio - 1.0))) if len(ended) else math.nan,
         n_sim=n_sim,
         calls=_mean([run.calls for run in runs]),
         seconds=_mean([run.seconds for run in runs]),
-        max_sim=runs[0].max_sim,
-        hidden=sum(hides_simulations(run) for run in runs) / len(runs),
-        reference_error=state.standard_error / p if p > 0 else 0.0,
-        overstated=sum(run.stated is not None and run.stated > run.n_sim for run in runs) / len(runs),
-        without_f=sum(run.n_sim == 0 for run in ended) / len(runs),
-        impossible=sum(not is_possible(run) for run in ended) / len(runs),
-        example=_find_example(runs),
-        same_points=_simulate_the_same(ended),
+        covered=covered,
+        low=sum(run.high < p for run in ended),
+        high=sum(run.low > p for run in ended),
+        far_warned=_share(warned, off > FAR),
+        wrong_warned=_share(warned, is_wrong),
+        right_warned=_share(warned, np.logical_not(is_wrong)),
+        faults=tuple(_find_faults(runs, covered, knowable)),
+    )
+
+
+def summarise(cells: Sequence[Cell]) -> Summary:
+    """Pool the cells of one method at one budget; regions that no method can know of, and p = 0, do not count."""
+    counted = [cell for cell in cells if cell.p > 0 and find_problem(cell.problem).knowable]
+    gains = [cell.gain for cell in counted if math.isfinite(cell.gain)]
+    nothing = Share(0, 0)
+    return Summary(
+        method=cells[0].method,
+        max_sim=cells[0].max_sim,
+        problems=len(counted),
+        covered=sum((cell.covered for cell in counted), nothing),
+        low=sum(cell.low for cell in counted),
+        high=sum(cell.high for cell in counted),
+        gain=statistics.geometric_mean(gains) if gains else math.nan,
+        gains=len(gains),
+        far_warned=sum((cell.far_warned for cell in counted), nothing),
+        wrong_warned=sum((cell.wrong_warned for cell in counted), nothing),
+        right_warned=sum((cell.right_warned for cell in counted), nothing),
+        seconds=_mean([cell.seconds for cell in counted]),
     )
 
 
 def is_possible(run: MethodRun) -> bool:
     """Return whether p is a probability within its interval, and the c.o.v., if there is one, not negative."""
     return 0.0 <= run.p <= 1.0 and run.low <= run.p <= run.high and not run.cov < 0.0
-
-
-def _find_example(runs: Sequence[MethodRun]) -> str:
-    """Return what the first run raised or, if none did, the first impossible answer, in a line."""
-    errors = [run.error for run in runs if run.error]
-    answers = [
-        f"p {run.p:.3g}, {run.low:.3g} to {run.high:.3g}, c.o.v. {run.cov:.3g}" for run in runs if not is_possible(run)
-    ]
-    text = " ".join([*errors, *answers, ""][0].split())
-    return text if len(text) <= LONGEST_EXAMPLE else f"{text[: LONGEST_EXAMPLE - 3]}..."
-
-
-def _simulate_the_same(runs: Sequence[MethodRun]) -> bool:
-    """Return whether runs of several seeds all simulated the same points."""
-    made = {run.points for run in runs}
-    return len({run.seed for run in runs}) > 1 and len(made) == 1 and "" not in made and runs[0].n_sim > 0
-
-
-def hides_simulations(run: MethodRun) -> bool:
-    """Return whether a run states fewer simulations than it made."""
-    return run.stated is not None and run.stated < run.n_sim
 
 
 def covers(run: MethodRun, p: float) -> bool:
@@ -192,46 +210,31 @@ def own_errors_off(run: MethodRun, p: float) -> float:
     return abs(run.p - p) / (run.cov * run.p) if run.cov > 0 else (0.0 if run.p == p else math.inf)
 
 
-@dataclass(frozen=True)
-class Power:
-    """Do warnings come with the runs that are wrong, and only with those?"""
-
-    wrong: int
-    """Runs off by more than 4 of their own standard errors."""
-    wrong_warned: int
-    right: int
-    """Runs within 2."""
-    right_warned: int
-    texts: dict[str, tuple[int, int, int]]
-    """Runs with each warning (numbers as #): wrong, right, neither."""
-
-
-def power_of(runs: Iterable[MethodRun]) -> Power:
-    """Return the power of the warnings over runs of one method."""
-    counts: Counter[str] = Counter()
-    texts: dict[str, Counter[str]] = defaultdict(Counter)
-    for run in runs:
-        off = own_errors_off(run, limit_state(run.problem).p)
-        kind = "wrong" if off > 4 else "right" if off <= 2 else "neither"
-        counts[kind] += 1
-        counts[f"{kind} warned"] += bool(run.warnings)
-        for text in {without_numbers(warning) for warning in run.warnings}:
-            texts[text][kind] += 1
-    return Power(
-        wrong=counts["wrong"],
-        wrong_warned=counts["wrong warned"],
-        right=counts["right"],
-        right_warned=counts["right warned"],
-        texts={
-            text: (count["wrong"], count["right"], count["neither"])
-            for text, count in sorted(texts.items(), key=lambda item: -item[1].total())
-        },
-    )
+def _find_faults(runs: Sequence[MethodRun], covered: Share, knowable: bool) -> Iterable[str]:
+    """Yield in words what a method that does what it claims would not do."""
+    ended = [run for run in runs if not run.error]
+    errors = [run.error for run in runs if run.error]
+    if errors:
+        text = " ".join(errors[0].split())
+        yield f"raised in {len(errors)} of {len(runs)} runs ({text[:LONGEST_EXAMPLE]})"
+    if impossible := [run for run in ended if not is_possible(run)]:
+        run = impossible[0]
+        answer = f"p {run.p:.3g}, {run.low:.3g} to {run.high:.3g}, c.o.v. {run.cov:.3g}"
+        yield f"answers that cannot be in {len(impossible)} of {len(runs)} runs ({answer})"
+    if any(run.stated not in (None, run.n_sim) for run in ended):
+        yield "states another number of simulations than it made"
+    budget, n_sim = runs[0].max_sim, _mean([run.n_sim for run in runs])
+    if budget is not None and n_sim > (1 + BUDGET_EXCESS) * budget:
+        yield f"makes {n_sim / budget:.2g} times the simulations of its budget"
+    if len({run.seed for run in ended}) > 1 and len({run.points for run in ended}) == 1:
+        yield "the same points at every seed"
+    elif knowable and ended and stats.binom.cdf(covered.count, covered.of, 0.95) < CHANCE:
+        yield f"intervals hold p in {covered}"
 
 
-def without_numbers(text: str) -> str:
-    """Replace the numbers in a text by #."""
-    return re.sub(r"[-+]?\d(?:[\d,]*\d)?(?:\.\d+)?(?:e[-+]?\d+)?", "#", text)
+def _share(warned: Sequence[bool], among: Sequence[bool] | np.ndarray) -> Share:
+    """Return how many of the runs in question warn."""
+    return Share(int(np.sum(np.logical_and(warned, among))), int(np.sum(among)))
 
 
 def _mean(values: Sequence[float] | FloatArray) -> float:
@@ -245,79 +248,3 @@ def _median(values: Sequence[float]) -> float:
 def _spread(values: FloatArray) -> float:
     with np.errstate(invalid="ignore"):  # an infinite answer has no spread
         return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
-
-
-def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
-    """Return the faults of a method on a problem in words; none where it does what it claims.
-
-    Args:
-        cell: Its runs.
-        knowable: False where no method can know of a region of failure: bias and coverage are not judged there.
-    """
-    found = _find_broken_runs(cell)
-    if cell.max_sim is not None and cell.n_sim > (1 + BUDGET_EXCESS) * cell.max_sim:
-        found.append(f"makes {cell.n_sim / cell.max_sim:.2g} times the simulations of its budget")
-    if cell.same_points:  # one run, so that nothing is known of its bias and coverage
-        return (*found, _describe_one_run(cell))
-    ended = cell.runs - cell.raised
-    if not knowable or not ended:
-        return tuple(found)
-    if cell.p > 0 and cell.worst < READ_DIGITS:
-        found.append(f"p to {-math.log10(READ_DIGITS):.0f} digits in every run, as no draws give it")
-    bias = cell.mean - 1.0
-    error = math.hypot(cell.mean_se, cell.reference_error)
-    if ended >= LEAST_RUNS and abs(bias) > max(errors_allowed(ended) * error, NOTICED_BIAS) and not _is_bad_luck(cell):
-        found.append(f"biased: mean / p {cell.mean:.3g} +- {error:.2g}")
-    if _is_too_low(cell):
-        low, high = cell.coverage_interval
-        held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
-        found.append(f"{held} ({100 * low:.0f} to {100 * high:.0f} %)")
-    return tuple(found)
-
-
-def _find_broken_runs(cell: Cell) -> list[str]:
-    """Return faults of single runs, which need no chance to be called so."""
-    found = []
-    if cell.raised:
-        found.append(f"raised in {cell.raised} of {cell.runs} runs ({cell.example})")
-    if cell.impossible:
-        example = "" if cell.raised else f" ({cell.example})"
-        found.append(f"answers that cannot be in {100 * cell.impossible:.0f} % of the runs{example}")
-    if cell.hidden:
-        found.append(f"states fewer simulations than it made in {100 * cell.hidden:.0f} % of the runs")
-    if cell.overstated:
-        found.append(f"states more simulations than it made in {100 * cell.overstated:.0f} % of the runs")
-    if cell.without_f:
-        found.append(f"answers without a simulation in {100 * cell.without_f:.0f} % of the runs")
-    return found
-
-
-def _describe_one_run(cell: Cell) -> str:
-    held = "holds" if cell.coverage > 0 else "does not hold"
-    ratio = f", p over the true one {cell.mean:.3g}" if cell.p > 0 else ""
-    return f"the same points at every seed: {cell.runs} runs are one, whose interval {held} p{ratio}"
-
-
-def errors_allowed(runs: int) -> float:
-    """Return the standard errors that a mean of so many runs may be off, by Student's distribution."""
-    return float(stdtrit(runs - 1, ndtr(BIAS_ERRORS)))
-
-
-def _is_bad_luck(cell: Cell) -> bool:
-    """Return whether a mean below p may come from few hits or none, which show too small a spread.
-
-    The variance of a mean of hits is as its expectation, so that around p it is what was seen, over mean / p. Where
-    no run saw a failure, plain Monte Carlo of all simulations sees none with probability exp(-n p).
-    """
-    if cell.mean == 0:
-        return math.exp(-cell.p * cell.n_sim * cell.runs) > 2 * float(ndtr(-BIAS_ERRORS))
-    if not 0 < cell.mean < 1:
-        return False
-    error = math.hypot(cell.mean_se / math.sqrt(cell.mean), cell.reference_error)
-    return 1 - cell.mean <= BIAS_ERRORS * error
-
-
-def _is_too_low(cell: Cell) -> bool:
-    """Return whether a method that covers as it claims would hardly ever cover so little."""
-    held = round(cell.coverage * cell.runs)
-    return float(stats.binom.cdf(held, cell.runs, NOMINAL_COVERAGE)) < CHANCE

@@ -18,7 +18,7 @@ from rare_envs.startup import DRIVING, __version__
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("agents", "rare_envs", "samplers", "training")
-OPTIONAL = {"dask", "openturns", "pandas", "ray", "UQpy"}
+OPTIONAL = {"dask", "openturns", "pandas", "ray"}
 """Libraries that users bring themselves, or that an extra of `samplers` installs."""
 
 
