@@ -95,7 +95,7 @@ def parallel() -> LimitState:
     betas, rho = (1.4, 1.7, 1.9, 1.3, 1.6), 0.35
 
     def f(u: FloatArray) -> FloatArray:
-        return np.asarray((betas - math.sqrt(rho) * u[:, :1] - math.sqrt(1 - rho) * u[:, 1:6]).max(axis=1))
+        return np.asarray(np.max(betas - math.sqrt(rho) * u[:, :1] - math.sqrt(1 - rho) * u[:, 1:6], axis=1))
 
     return LimitState(f, 12, one_factor(betas, rho, lambda q: float(np.prod(q))))
 
