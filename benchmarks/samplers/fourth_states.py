@@ -217,7 +217,7 @@ def claims(limit: float = 33.0, h: float = 0.002) -> LimitState:
         above += [ndtr(-np.log(np.maximum(x, 1e-300) / median) / sigma) for median, sigma in lognormals]
         return np.array(above)
 
-    x = -0.6 + h * np.arange(37_501)
+    x: FloatArray = np.linspace(-0.6, -0.6 + 37_500 * h, 37_501)
     masses = tails(x - h / 2) - tails(x + h / 2)
     masses[:, -1] = tails(x[-1:] - h / 2)[:, 0]
     of_sum = np.fft.irfft(np.fft.rfft(masses, 2**18).prod(axis=0), 2**18)

@@ -61,7 +61,7 @@ def curved_pair() -> LimitState:
 
     def f(u: FloatArray) -> FloatArray:
         bowl = 3.05 + 0.06 * (u[:, 2:8] ** 2).sum(axis=1) - u[:, 0]
-        return np.minimum(bowl, 0.5 * np.tanh(1.5 * (3.75 + u[:, 1])))
+        return np.asarray(np.minimum(bowl, 0.5 * np.tanh(1.5 * (3.75 + u[:, 1]))))
 
     return LimitState(f, 15, any_of(bowl_probability(3.05, 0.06, 6), normal_cdf(-3.75)))
 
@@ -106,7 +106,7 @@ def series() -> LimitState:
 
     def f(u: FloatArray) -> FloatArray:
         margins = betas - math.sqrt(rho) * u[:, :1] - math.sqrt(1 - rho) * u[:, 1:7]
-        return np.asarray((slopes * np.sinh(0.8 * margins)).min(axis=1))
+        return np.asarray(np.min(slopes * np.sinh(0.8 * margins), axis=1))
 
     return LimitState(f, 25, one_factor(betas, rho, lambda q: any_of(*q)))
 
