@@ -23,8 +23,8 @@ from samplers.methods.two_stage.exploration import Sizes, draw_isotropic, find_r
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.refinement import (
     RefinementState,
-    badly_described,
     build_proposal,
+    least_described,
     refine_once,
     start_refinement,
     typical_weights,
@@ -243,8 +243,9 @@ def _refine(
         state, refinement = yield from _draw_round(run, state, refinement, proposal, n)
     if number == 1 and n > 0 and not refinement.exploration.noisy:
         refinement = yield from _look_for_noise(run, state, refinement)
-    described = not state.rounds or not badly_described(refinement, state.last_u, state.rounds[-1].log_weights)
-    final = number == len(shares) or (described and number >= len(PROPOSAL.round_shares))
+    described = least_described(refinement, state.last_u, state.rounds[-1].log_weights) if state.rounds else 1.0
+    enough = number >= len(PROPOSAL.round_shares) and described >= PROPOSAL.described
+    final = number == len(shares) or enough
     return state, refinement, build_proposal(refinement, state.history, final=final), final
 
 
@@ -378,7 +379,7 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
     doubts = [
         *check_base_draws(whole.p, hits, len(state.base_f)),
         *check_rounds(sample, state.rounds),
-        *check_regions(whole, badly_described(refinement, np.concatenate(failing), sample.draws.log_weights)),
+        *check_regions(whole, least_described(refinement, np.concatenate(failing), sample.draws.log_weights)),
         *check_discovery(whole.p, discovery, goal.confidence),
     ]
     return replace(

@@ -206,16 +206,17 @@ def nearest_regions(state: RefinementState, u: FloatArray) -> tuple[NDArray[np.i
     return regions[log_r.argmax(axis=0)], log_r.max(axis=0)
 
 
-def badly_described(state: RefinementState, u: FloatArray, log_weights: FloatArray) -> int:
-    """Return the number of regions whose failing draws u (n, d) have weights too uneven to tell what it adds to p.
+def least_described(state: RefinementState, u: FloatArray, log_weights: FloatArray) -> float:
+    """Return effective over actual failures among failing draws u (n, d), in the region where that is least.
 
-    Another region may be described so well that the draws are worth enough all in all.
+    Another region may be described so well that the draws are worth enough all in all. Regions with fewer than 10 do
+    not count; 1 where no region has as many, or f is noisy.
     """
     if len(u) == 0 or state.exploration.noisy:
-        return 0
+        return 1.0
     nearest, _ = nearest_regions(state, u)
     weights = [log_weights[nearest == k] for k in range(len(state.regions))]
-    return sum(len(own) >= 10 and effective_sample_size(own) < PROPOSAL.described * len(own) for own in weights)
+    return min((effective_sample_size(own) / len(own) for own in weights if len(own) >= 10), default=1.0)
 
 
 def _fit_chains(region: Region, most: int, rng: np.random.Generator) -> list[SubspaceGaussian]:

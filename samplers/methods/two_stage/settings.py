@@ -24,9 +24,10 @@ class EXPLORATION:
     """Draws of the exploration (`exploration.py`) at the usual budget."""
 
     base = 500  # Base draws; five levels of a tenth each reach 1e-5 from there
-    wide = ((1.5, 400), (2.2, 120), (3.0, 80), (4.2, 100))
-    """(s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15; at s = 1.5 a ball that f does not
-    announce is hit two to three times as often as by base draws: with 120 of them 7 of 20 runs on pit_d5 missed it."""
+    wide = ((1.5, 400), (2.2, 80), (3.0, 60), (4.2, 60))
+    """(s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15, at s = 4.2 one at beta = 6 by one in
+    13; at s = 1.5 a ball that f does not announce is hit two to three times as often as by base draws. With 120, 120
+    and 80 of the first three, 7 of 20 runs on pit_d5 missed its ball."""
     level = 250  # Points of each level of subset simulation
     level_fraction = 0.1  # Conditional probability of a level (Au and Beck 2001)
     level_acceptance = 0.44  # Acceptance that its chains are adapted to (Papaioannou, Betz, Zwirglmaier, Straub 2015)
@@ -151,6 +152,7 @@ class DOUBT:
     false_alarm = 1e-3  # Probability with which a check of the base draws warns of a right estimate
     max_deviation = 4.0
     """Standard errors between rounds and estimate; a normal distribution exceeds it once in 16,000 runs."""
+    described = 0.1  # Effective over actual failures of the draws in a region with less
     max_point_share = 0.25  # Share of p that a typical point of a region may stand for as a draw
     max_unseen_share = 0.3  # Share of p that may be in regions that were not found
 

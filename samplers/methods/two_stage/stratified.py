@@ -234,19 +234,19 @@ def check_rounds(final: StratifiedSample, rounds: Sequence[Draws]) -> list[str]:
     return [f"The search rounds give p = {before:.2e}, {apart:.1f} standard errors from the final estimate."]
 
 
-def check_regions(final: StratifiedSample, uneven: int) -> list[str]:
+def check_regions(final: StratifiedSample, described: float) -> list[str]:
     """Return warnings about regions that the proposal does not describe: p may be far too low, and its error too.
 
-    Final draws in `uneven` regions have very uneven weights; or a likely state of the chains in some region would be a
-    large share of p as a draw, of which that the draws met hardly any says nothing.
+    In some region the final draws that fail are worth a share `described` of as many independent failures; or a likely
+    state of its chains would be a large share of p as a draw, of which that the draws met hardly any says nothing.
     """
     if len(final.draws.f) == 0:
         return []
     n, share = len(final.typical), final.typical / max(final.draws.n * final.p, 1e-300)
     lost = int((share > DOUBT.max_point_share).sum())
     barely = f"The proposal barely covers {lost} of {n} regions found: one draw there adds {share.max():.0%} of p."
-    badly = f"The draws in {uneven} of {n} regions found have very uneven weights: p may be too low there."
-    return [barely] * (lost > 0) + [badly] * (uneven > 0)
+    badly = f"In a region found the failing draws are worth {described:.1%} of their number: p may be too low there."
+    return [barely] * (lost > 0) + [badly] * (described < DOUBT.described)
 
 
 def check_discovery(p: float, discovery: Discovery, confidence: float) -> list[str]:
