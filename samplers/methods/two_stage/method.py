@@ -84,7 +84,7 @@ class TwoStage(Method):
     1 - M. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25, 0.005 for 200. The c.o.v. is that of the sampling
     alone.
 
-    *Warnings* (`stratified.py`): uneven weights, all in all and in a region, base draws that fail more often than p
+    *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p
     allows, rounds that contradict the estimate, regions that the last draws hardly reach, and a search of so few
     lineages that M may exceed 0.3. A region that neither f announces nor any draw has hit gives no warning;
     `Estimate.unseen` bounds it.
@@ -353,7 +353,7 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
     goal, inputs, stopped = run.goal, run.simulator.inputs, False
     typical = typical_weights(refinement, proposal, state.history)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
-    whole, failing = sample, list[FloatArray]()
+    whole = sample
     size = run.left if goal.target_cov is None else _target_batch(run)
     while run.left_at_all > 0:
         try:
@@ -362,7 +362,6 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
-        failing.append(batch.u[batch.f <= goal.gamma])
         whole = reduce(StratifiedSample.join, (each for each, _ in state.counted), sample)
         _record_draws(run, batch, whole.p, whole.cov, whole.draws.ess)
         if run.meets_target(whole.cov):
@@ -379,7 +378,7 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
     doubts = [
         *check_base_draws(whole.p, hits, len(state.base_f)),
         *check_rounds(sample, state.rounds),
-        *check_regions(whole, least_described(refinement, np.concatenate(failing), sample.draws.log_weights)),
+        *check_regions(whole),
         *check_discovery(whole.p, discovery, goal.confidence),
     ]
     return replace(

@@ -94,7 +94,7 @@ class PROPOSAL:
     further_shares = (0.14, 0.14)  # The same of further rounds, while a region is badly described
     described = 0.1
     """Effective failures over failures of a round in a region, of which it has 10 or more, from which on the region is
-    described. On unseen states less than this told 12 of 18 wrong runs from right ones, and 8 of 122 right ones too."""
+    described. As a warning of the final draws it says nothing: 64 of 1,240 right runs had less, 1 of 22 wrong ones."""
     good_rate = 0.1  # Independent failures for each draw of a round with which its proposal describes the failures
     base_share = (0.05, 0.1)  # Least share of base draws: no weight exceeds 20; the second one where f is noisy
     tempered_share = (0.1, 0.5)
@@ -152,7 +152,6 @@ class DOUBT:
     false_alarm = 1e-3  # Probability with which a check of the base draws warns of a right estimate
     max_deviation = 4.0
     """Standard errors between rounds and estimate; a normal distribution exceeds it once in 16,000 runs."""
-    described = 0.1  # Effective over actual failures of the draws in a region with less
     max_point_share = 0.25  # Share of p that a typical point of a region may stand for as a draw
     max_unseen_share = 0.3  # Share of p that may be in regions that were not found
 

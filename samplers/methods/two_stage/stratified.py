@@ -234,19 +234,18 @@ def check_rounds(final: StratifiedSample, rounds: Sequence[Draws]) -> list[str]:
     return [f"The search rounds give p = {before:.2e}, {apart:.1f} standard errors from the final estimate."]
 
 
-def check_regions(final: StratifiedSample, described: float) -> list[str]:
-    """Return warnings about regions that the proposal does not describe: p may be far too low, and its error too.
+def check_regions(final: StratifiedSample) -> list[str]:
+    """Return a warning if a likely state of the chains in some region would be a large share of p as a draw.
 
-    In some region the final draws that fail are worth a share `described` of as many independent failures; or a likely
-    state of its chains would be a large share of p as a draw, of which that the draws met hardly any says nothing.
+    The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.
     """
-    if len(final.draws.f) == 0:
-        return []
-    n, share = len(final.typical), final.typical / max(final.draws.n * final.p, 1e-300)
+    share = final.typical / max(final.draws.n * final.p, 1e-300)
     lost = int((share > DOUBT.max_point_share).sum())
-    barely = f"The proposal barely covers {lost} of {n} regions found: one draw there adds {share.max():.0%} of p."
-    badly = f"In a region found the failing draws are worth {described:.1%} of their number: p may be too low there."
-    return [barely] * (lost > 0) + [badly] * (described < DOUBT.described)
+    if lost == 0 or len(final.draws.f) == 0:
+        return []
+    return [
+        f"The proposal barely covers {lost} of {len(share)} regions found: one draw there adds {share.max():.0%} of p."
+    ]
 
 
 def check_discovery(p: float, discovery: Discovery, confidence: float) -> list[str]:
