@@ -39,6 +39,7 @@ from samplers.sample import (
     SimulatedPoints,
     Status,
     describe_outcome,
+    corner_missed,
 )
 
 if TYPE_CHECKING:
@@ -66,14 +67,24 @@ class Estimate(EstimateData, Kept):
 
     @property
     def unseen(self) -> float:
-        """Largest probability M of a region of failure that may have been missed by all base draws.
+        """Largest probability M of a region of failure, of any shape, that may have been missed by all base draws.
 
-        M = 1 - (1 - confidence)^(1 / n) for n base draws, the one-sided Clopper-Pearson bound without a hit: n draws
-        all miss a larger region with probability under 1 - confidence. M = 1 without base draws. Levels of f, wide
-        draws and chains may find far smaller regions, but guarantee nothing. Of a sum over strata, a region may lie in
+        M = 1 - (1 - confidence)^(1 / n) for n base draws, about 3 / n, the one-sided Clopper-Pearson bound without a
+        hit: n draws all miss a larger region with probability under 1 - confidence. M = 1 without base draws. Levels
+        of f and chains may find far smaller regions, but guarantee nothing. Of a sum over strata, a region may lie in
         several of them.
         """
         return self.bound_missed(self.confidence)
+
+    @property
+    def unseen_corner(self) -> float:
+        """The same for a region beyond up to three planes at right angles, which wide draws meet more often.
+
+        Of n draws from N(0, s^2 I) each meets the region of probability Phi(-b)^3 with probability Phi(-b / s)^3, in
+        the standard normal coordinates that are searched. It is `unseen` without wide draws.
+        """
+        drawn = ((1.0, self.base_draws), *self.wide_draws)
+        return corner_missed(drawn, self.confidence) if self.wide_draws else self.unseen
 
     def curve(self, gammas: ArrayLike) -> Curve:
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
@@ -223,20 +234,14 @@ class Estimate(EstimateData, Kept):
 
     @property
     def proviso(self) -> str:
-        """Conditions under which p and its interval are valid, in words that follow "valid"."""
-        fixed = f"given that {self.given}, " if self.given else ""
-        if self.base_draws == 0:
-            return f"{fixed}if no failure region was missed (no base draws limit its probability)"
-        if self.p == 0 and self.failures.total == 0:  # the interval itself is about what was missed
-            return (
-                f"{fixed}without further assumptions: none of {self.base_draws:,} base draws failed, so p is below "
-                f"{self.unseen:.1e} with {100 * self.confidence:g} % confidence (the upper end of the interval has "
-                f"{50 * (1 + self.confidence):g} % or more)"
-            )
-        return (
-            f"{fixed}if no failure region was missed; {self.base_draws:,} base draws would have met one with "
-            f"probability above {self.unseen:.1e} ({100 * self.confidence:g} % confidence)"
-        )
+        """What is not in p and its interval: what the problem holds fixed, and regions of failure that no draw met."""
+        fixed = f"given that {self.given}; " if self.given else ""
+        by = f"({self.base_draws:,} base draws, {100 * self.confidence:g} % confidence)"
+        if self.p == 0 and self.failures.total == 0 < self.base_draws:  # the interval itself is about what was missed
+            return f"{fixed}no draw met a failure: p is below {self.unseen:.1e} {by}"
+        wide = sum(n for _, n in self.wide_draws)
+        corner = f"; a corner of three planes: below {self.unseen_corner:.0e} ({wide:,} wide draws)" if wide else ""
+        return f"{fixed}a failure region that no draw met: below {self.unseen:.1e} {by}{corner}"
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.
@@ -283,7 +288,7 @@ class Estimate(EstimateData, Kept):
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{describe_outcome(self.status, self.warnings)}; {self.failures.total:,} failing points",
             *([f"  chosen {self.choice}"] if self.chose_another else []),
-            f"  valid {self.proviso}",
+            f"  {self.proviso}",
         ]
         lines += [f"  remark: {text}" for text in self.remarks]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
@@ -364,11 +369,12 @@ class Estimate(EstimateData, Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
-        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen given gain remarks choice seed"
+        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen unseen_corner given gain remarks seed"
         uncertainty, points = self.base_uncertainty, self.failures
         data = {name: getattr(self, name) for name in plain.split()} | {
             "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),
             "warnings": self.warnings,
+            "choice": self.choice,
             "final_draws": None if self.sample is None else self.sample.n_units,
             "parts": [part.to_dict() for part in self.parts],
             "status": str(self.status),

@@ -403,7 +403,7 @@ class Report:
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
             "average": self.average,
-            "valid": self.estimate.proviso,
+            "proviso": self.estimate.proviso,
             "gate": convert(self.verdict),
             "doubtful": self.doubtful,
             "doubts": self.warnings,

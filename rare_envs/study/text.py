@@ -254,6 +254,9 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
     if report.verdict is not None:
         ends += f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for the limit)"
     console.print(_write_row(f"{100 * estimate.confidence:g} % interval", ends))
+    if estimate.sequence is not None:
+        looks = "{:.3e} to {:.3e}, as the run stopped on what it saw".format(*estimate.sequence)
+        console.print(_write_row("at every look", looks))
     if report.verdict is not None:
         console.print(_write_row("limit", str(report.verdict)), style="bold")
     fixed = f"no interval: {report.study.base_name!r} has no refits to events, so p takes it as the truth"
@@ -330,9 +333,9 @@ def _list_effort(report: Report, details: bool) -> Iterator[Row]:
     time = f"{estimate.n_sim:,}{'' if details else ' simulations'} in {report.seconds:.1f} s{earlier} by {made_by}"
     rows = {"c.o.v.": f"{cov}; gain {gain}", "method": f"{run}; {time}"}
     if details:
-        rows = {"c.o.v.": cov, "simulations": time, "valid": estimate.proviso, "gain": gain, "method": run}
+        rows = {"c.o.v.": cov, "simulations": time, "unseen": estimate.proviso, "gain": gain, "method": run}
     chosen = {"chosen": estimate.choice} if estimate.chose_another else {}
-    yield from ({**rows, **chosen} if details else {**rows, **chosen, "valid": estimate.proviso}).items()
+    yield from ({**rows, **chosen} if details else {**rows, **chosen, "unseen": estimate.proviso}).items()
 
 
 def _list_kinds(report: Report, details: bool) -> Iterator[Row]:

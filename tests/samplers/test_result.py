@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
@@ -50,15 +51,21 @@ def test_says_how_large_a_region_may_have_been_missed():
     estimate = estimate_adss()
     assert estimate.base_draws == 1000
     assert (1 - estimate.unseen) ** 1000 == pytest.approx(0.05)
-    assert (
-        "valid if no failure region was missed; 1,000 base draws would have met one with probability above 3.0e-03 "
-        "(95 % confidence)" in str(estimate)
-    )
+    said = "a failure region that no draw met: below 3.0e-03 (1,000 base draws, 95 % confidence)"
+    assert said == estimate.proviso and said in str(estimate)
     assert (1 - estimate_adss(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
-    assert estimate.to_dict()["unseen"] == estimate.unseen
-    without = replace(estimate, base_draws=0)
-    assert without.unseen == 1
-    assert "no base draws" in str(without)
+    assert estimate.to_dict()["unseen"] == estimate.unseen == estimate.unseen_corner
+    assert replace(estimate, base_draws=0).unseen == 1
+
+
+def test_wide_draws_bound_a_corner_that_was_missed():
+    estimate = replace(estimate_adss(), base_draws=600, wide_draws=((2.0, 200), (3.0, 100)))
+    b = -stats.norm.ppf(estimate.unseen_corner ** (1 / 3))
+    missed = [(1 - stats.norm.cdf(-b / s) ** 3) ** n for s, n in ((1, 600), (2, 200), (3, 100))]
+    assert np.prod(missed) == pytest.approx(0.05)
+    assert estimate.proviso.endswith(f"; a corner of three planes: below {estimate.unseen_corner:.0e} (300 wide draws)")
+    assert estimate.to_dict()["unseen_corner"] == estimate.unseen_corner < 1e-2 * estimate.unseen
+    assert replace(estimate, wide_draws=((2.0, 3),), base_draws=0).unseen_corner == 1
 
 
 def test_without_a_failure_it_says_which_bound_has_which_level():
@@ -68,11 +75,7 @@ def test_without_a_failure_it_says_which_bound_has_which_level():
     assert data["cov"] is None and data["gain"] is None  # no infinities
     assert "warning: None of 1,000 simulations failed" in text and "c.o.v. not known" in text and "gain" not in text
     assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
-    assert estimate.proviso == (
-        "without further assumptions: none of 1,000 base draws failed, so p is below 3.0e-03 with 95 % confidence "
-        "(the upper end of the interval has 97.5 % or more)"
-    )
-    assert "with 90 % confidence (the upper end of the interval has 95 %" in replace(estimate, confidence=0.9).proviso
+    assert estimate.proviso == "no draw met a failure: p is below 3.0e-03 (1,000 base draws, 95 % confidence)"
 
 
 def test_says_what_the_problem_holds_fixed():
@@ -80,8 +83,7 @@ def test_says_what_the_problem_holds_fixed():
     problem = SimpleNamespace(dim=2, base=problem.base, evaluate=problem.evaluate, given="one die is fixed")
     fixed = samplers.estimate(problem, "mc", seed=1, max_sim=500)
     assert fixed.to_dict()["given"] == "one die is fixed"
-    assert "valid given that one die is fixed, if no failure region was missed; " in str(fixed)
-    assert "fixed, if no failure region was missed (no base draws limit" in replace(fixed, base_draws=0).proviso
+    assert "\n  given that one die is fixed; a failure region that no draw met: below " in str(fixed)
     assert samplers.MonteCarlo(n=500).start(problem, seed=1).result().given == "one die is fixed"
 
 

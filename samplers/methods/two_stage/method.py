@@ -323,7 +323,8 @@ def _fall_back(run: SearchRun, state: RunState, levels: int) -> Steps:
     outcome = yield from spend_on_subset_simulation(run.inputs, run.goal, levels, run.left_at_all, known, run.rng)
     unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
     whole = before if unfinished else _reconcile(outcome, before)
-    return replace(whole, trace=trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
+    drawn = state.base_draws + outcome.base_draws
+    return replace(whole, trace=trace + outcome.trace, base_draws=drawn, wide_draws=before.wide_draws)
 
 
 def _reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
@@ -466,4 +467,5 @@ def _outcome(run: SearchRun, state: RunState, draws: Draws, cov: float, interval
         trace=run.simulator.close_trace(),
         no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
         base_draws=state.base_draws,
+        wide_draws=Sizes.within(run.budget).wide if len(state.base_f) else (),
     )

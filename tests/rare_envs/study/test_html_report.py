@@ -74,7 +74,7 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     assert f"p = {100 * result['p']:.2g}\xa0%" in text  # a number and its unit stay in one line
     assert "ends in a collision" in text and "Mode 1: the ego runs into a vehicle ahead" in text
     assert re.search(r"the ego into the lead after \d\.\d s, at [\d.]+ m/s", text)
-    assert "m/s of it, at right angles to what touches" in text and result["valid"].split(";")[0] in text
+    assert "m/s of it, at right angles to what touches" in text and result["proviso"].split(" (")[0] in text
     for name in ("ego_speed [m/s]", "lead_speed [m/s]", "gap [m]"):
         assert name in text
     assert f"rare-envs replay {folder} --failure {result['modes'][0]['failure']}" in text

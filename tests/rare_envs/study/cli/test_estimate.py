@@ -44,7 +44,7 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, t
     assert result.exit_code == 0
     assert "warning: " not in result.stdout
     assert "remark: None of 2,000 simulations failed: p = 0 with a one-sided interval." in result.stdout
-    assert "none of 2,000 base draws failed, so p is below 1.5e-03 with 95 % confidence" in result.stdout
+    assert "no draw met a failure: p is below 1.5e-03 (2,000 base draws, 95 % confidence)" in result.stdout
     written = json.loads((tmp_path / "run" / "result.json").read_text())
     assert written["doubtful"] is False and written["doubts"] == []
     assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
@@ -55,7 +55,7 @@ def test_the_answer_is_short_unless_details_are_asked_for(cli: Cli, risky: str, 
     words = (*SMALL, "--base", risky)
     short, long = cli(*words).stdout, cli(*words, "--details").stdout
     names = [line.split()[0] for line in short.splitlines()]
-    assert names == "P[f 95 base collisions c.o.v. method valid of severity most unusual all".split()
+    assert names == "P[f 95 base collisions c.o.v. method unseen of severity most unusual all".split()
     assert len(long.splitlines()) > len(names) and "all intervals and parameters" not in long
     assert short.splitlines()[:4] == long.splitlines()[:4]
     assert short.splitlines()[-1] == "all intervals and parameters: --details"
