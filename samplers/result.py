@@ -38,8 +38,8 @@ from samplers.sample import (
     Sample,
     SimulatedPoints,
     Status,
-    describe_outcome,
     corner_missed,
+    describe_outcome,
 )
 
 if TYPE_CHECKING:
