@@ -4,7 +4,7 @@ import math
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms, check_settings
 from samplers.sample import (
     COARSE,
+    Closest,
     DrawWeights,
     Failures,
     Interval,
@@ -98,6 +99,8 @@ class Outcome:
     """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
     parts: "tuple[Part, ...]" = ()
     """The strata of the base distribution, whose p_k with their shares w_k add up to p; empty where it has none."""
+    chosen: "Choice | None" = field(default=None, compare=False, repr=False)
+    """Method that the method of the run chose for it, as `Auto` does; None where it chose none."""
 
     def bound_missed(self, confidence: float) -> float:
         """Return the largest probability of a region that all base draws miss with probability 1 - confidence."""
@@ -324,21 +327,16 @@ class Stepping(Protocol):
         """Estimate P[f(X) <= goal.gamma], X ~ inputs.base."""
 
 
-class Choice(NamedTuple):
-    """A method for one run, and why it was chosen, its name first; empty where nothing was chosen.
+@dataclass(frozen=True)
+class Choice:
+    """A method that another one chose for a run, such as `Auto`, and why, its name first.
 
     The text of the result says it where it is `unusual`: another method than most runs have.
     """
 
     method: Stepping
-    why: str = ""
+    why: str
     unusual: bool = False
-
-
-def choose_method(method: Stepping, inputs: Inputs, goal: Goal) -> Choice:
-    """Return the method itself, or what it chooses: `Auto`, or one of your own that has `choose(inputs, goal)`."""
-    choose: Callable[[Inputs, Goal], Choice] | None = getattr(method, "choose", None)
-    return Choice(method) if choose is None else choose(inputs, goal)
 
 
 def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:
@@ -388,10 +386,8 @@ class EstimateData(Outcome):
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
     column_names: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """Names of the columns of x, the problem's attribute `column_names`; empty where it has none."""
-    choice: str = field(default="", compare=False)
-    """Method that `Auto` chose and why; empty where the method was named."""
-    chose_another: bool = field(default=False, compare=False, repr=False)
-    """Whether that is another method than the usual one, which the text says; `to_dict` has every choice."""
+    closest: Closest | None = field(default=None, compare=False, repr=False)
+    """The simulation with the least f of all, search included; None where none had an outcome."""
     ensemble_run: "EstimateData | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
     spans: tuple[tuple[int, int, int], ...] = field(default=(), compare=False, repr=False)
@@ -401,6 +397,11 @@ class EstimateData(Outcome):
     """All simulations, where `estimate` was told to keep them (`keep_points=True`)."""
     refit_ratios: list[tuple[tuple[object, ...], FloatArray]] = field(default_factory=list, compare=False, repr=False)
     """Density ratios of the refits at the failing points with what they are of, once they were asked for."""
+
+    @property
+    def choice(self) -> str:
+        """Method that `Auto` chose and why, on one line; empty where the method was named."""
+        return "" if self.chosen is None else self.chosen.why
 
     def describe_simulations(self, first: int, n: int) -> SimulationRows:
         """Return what simulations first, ..., first + n - 1 were made for, in the order of their making."""

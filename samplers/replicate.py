@@ -13,6 +13,7 @@ from scipy.special import chdtrc, stdtrit
 
 from samplers.method import (
     Answer,
+    Choice,
     Goal,
     Interrupted,
     Outcome,
@@ -228,7 +229,8 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         hits, n = counts
         no_outcome = sum(each.no_outcome_share * each.counts[0] for each in used if each.counts)
         whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
-        return replace(whole, sample=_merge_samples(used, shares), draw_weights=weights, remarks=remarks)
+        sample, chosen = _merge_samples(used, shares), _merge_choices(used)
+        return replace(whole, sample=sample, draw_weights=weights, remarks=remarks, chosen=chosen)
     left_out = len(outcomes) - len(used)
     about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
     if len(used) == 1:
@@ -250,7 +252,15 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         base_draws=sum(outcome.base_draws for outcome in used),
         wide_draws=tuple(wide for outcome in used for wide in outcome.wide_draws),
         draw_weights=weights,
+        chosen=_merge_choices(used),
     )
+
+
+def _merge_choices(outcomes: Sequence[Outcome]) -> Choice | None:
+    """Return the choice of the first run, with the words of those that chose otherwise."""
+    choices = [outcome.chosen for outcome in outcomes if outcome.chosen is not None]
+    why = "; ".join(dict.fromkeys(choice.why for choice in choices))
+    return replace(choices[0], why=why, unusual=any(choice.unusual for choice in choices)) if choices else None
 
 
 def _list_known(parts: Sequence[Part]) -> list[Outcome]:

@@ -17,7 +17,7 @@ from samplers.analysis.gate import Pilot, Verdict, judge_estimate
 from samplers.analysis.reweight import Reweighted, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import Share, require_sample, split_by_kind
-from samplers.method import EstimateData, Outcome, Part, Stepping
+from samplers.method import Choice, EstimateData, Outcome, Part, Stepping
 from samplers.output import (
     Kept,
     StoredMethod,
@@ -31,6 +31,7 @@ from samplers.output import (
 )
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import (
+    Closest,
     DrawWeights,
     Failures,
     Layer,
@@ -267,6 +268,15 @@ class Estimate(EstimateData, Kept):
             axes.set_title(f"P[f ≤ {self.gamma:g}] = {self.p:.2e}")
         return axes
 
+    @property
+    def _headline(self) -> str:
+        """p, or where p = 0 the bound and what it rests on."""
+        if self.p > 0:
+            return f"P[f <= {self.gamma:g}] = {self.p:.3e}"
+        failing = f"only {self.failures.total:,} of the search" if self.failures.total else "no failure"
+        about = f"{failing} in {self.n_sim:,} simulations"
+        return f"P[f <= {self.gamma:g}] below {self.interval[1]:.1e} ({100 * self.confidence:g} %): {about}"
+
     def __repr__(self) -> str:
         low, high = self.interval
         doubts = f", {len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}" if self.warnings else ""
@@ -280,14 +290,14 @@ class Estimate(EstimateData, Kept):
         gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
         cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
         lines = [
-            f"P[f <= {self.gamma:g}] = {self.p:.3e}",
+            self._headline,
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
             *(["  at every look [{:.3e}, {:.3e}], as the run stopped on what it saw".format(*looks)] if looks else []),
             *(f"  {part}" for part in self.parts),
             *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{describe_outcome(self.status, self.warnings)}; {self.failures.total:,} failing points",
-            *([f"  chosen {self.choice}"] if self.chose_another else []),
+            *([f"  chosen {self.choice}"] if self.chosen is not None and self.chosen.unusual else []),
             f"  {self.proviso}",
         ]
         lines += [f"  remark: {text}" for text in self.remarks]
@@ -378,6 +388,7 @@ class Estimate(EstimateData, Kept):
             "final_draws": None if self.sample is None else self.sample.n_units,
             "parts": [part.to_dict() for part in self.parts],
             "status": str(self.status),
+            "closest": None if self.closest is None else {"x": self.closest.x.tolist(), "f": self.closest.f},
             "trace": [asdict(level) for level in self.trace],
             "failures": {"total": points.total}
             | {name: getattr(points, name).tolist() for name in ("x", "f", "log_p0")},
@@ -424,4 +435,4 @@ def without_base(estimate: _EstimateT) -> _EstimateT:
 
 
 register_stored(StoredEstimate, Estimate, Outcome, Part, BaseUncertainty, Failures, Level, Status, StoredMethod)
-register_stored(Sample, Layer, DrawWeights, SimulatedPoints)
+register_stored(Sample, Layer, DrawWeights, SimulatedPoints, Choice, Closest)

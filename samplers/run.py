@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.reweight import check_refits
 from samplers.analysis.weighted import estimate_known
-from samplers.method import Answer, Choice, Goal, Outcome, Request, Stepping, TermsOffer, choose_method
+from samplers.method import Answer, Goal, Outcome, Request, Stepping, TermsOffer
 from samplers.problem import (
     ON_ERROR,
     Distribution,
@@ -42,6 +42,7 @@ from samplers.replicate import (
 )
 from samplers.result import Estimate
 from samplers.sample import (
+    Closest,
     Failures,
     Interval,
     SimulatedPoints,
@@ -166,6 +167,17 @@ def choose_seed(seed: int | None) -> int:
     return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
 
 
+SEARCHED = 2000
+"""Simulations from which on a search by levels of f is worth while in any dimension."""
+
+
+def advise(n_sim: int, closest: Closest) -> str:
+    """Return how near a run without a failure that counts came to one, and what would do better."""
+    more = max(SEARCHED, 10 ** math.ceil(math.log10(4 * max(n_sim, 1))))
+    came = f"The nearest approach was {closest}. " if closest.f < math.inf else ""
+    return f"{came}More simulations (max_sim={more}, --max-sim {more}) would search further towards failure."
+
+
 class Run:
     """An estimation whose simulations are made elsewhere; `Method.start` makes one.
 
@@ -226,13 +238,12 @@ class Run:
         most = self._goal.max_sim
         shares = [None if most is None else most * (i + 1) // n - most * i // n for i in range(n)]
         strata = read_strata(problem.base)
-        goal = replace(self._goal, max_sim=shares[0])  # the smallest share
-        self._choice = Choice(method) if strata else choose_method(method, self._inputs, goal)
         plain_draws = int(getattr(problem, "plain_draws", 0))  # a problem need not have it
-        self._method = SumOfStrata(method, strata, plain_draws) if strata else self._choice.method
+        self._named, self._method = method, SumOfStrata(method, strata, plain_draws) if strata else method
         self.progress, self._listener = Progress(n_sim=0, max_sim=self._goal.max_sim), listener
         self._n_sim = self._n_errors = 0
         self._failures = Failures.empty(self._inputs.dim)
+        self._closest = Closest(np.full(self._inputs.dim, math.nan), math.inf)
         self._failing: list[tuple[FloatArray, FloatArray]] = []  # not yet among the failures
         self._spans: list[tuple[Replicate, int, int]] = []
         self._points: list[tuple[FloatArray, FloatArray]] | None = [] if keep_points else None
@@ -332,7 +343,7 @@ class Run:
         self._spans.append((replicate, n, spent))
         if f is None:
             return
-        missing = np.isnan(f)
+        self._closest, missing = self._closest.nearer(x, f), np.isnan(f)
         self._n_errors += int(missing.sum())
         failing = missing | (f <= self._goal.gamma)
         if failing.any():
@@ -390,6 +401,8 @@ class Run:
         elif not met:  # the interval holds, and is wider than was wished
             status = Status.BUDGET if status is Status.CONVERGED else status
             remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
+        if whole.p == 0:
+            remarks.append(advise(self._n_sim, self._closest))
         number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
         found = {"status": status, "warnings": tuple(warnings), "remarks": tuple(remarks), "parts": parts}
         interval = self._find_ends(whole)
@@ -400,14 +413,13 @@ class Run:
             n_sim=self._n_sim,
             gain=math.nan if may_add(whole.parts, whole.p) else gain_over_monte_carlo(whole.p, whole.cov, self._n_sim),
             failures=self._failures,
-            method=self._choice.method,
+            closest=self._closest if self._closest.f < math.inf else None,
+            method=self._named if whole.chosen is None else whole.chosen.method,
             seed=self._seed,
             base=self._inputs.base,
             on_error=self._on_error,
             given=self._given,
             column_names=self._column_names,
-            choice=self._choice.why,
-            chose_another=self._choice.unusual,
             spans=tuple((number[id(one)], n, cost) for one, n, cost in self._spans if id(one) in number),
             points=None if self._points is None else SimulatedPoints.join(self._points, self._inputs.dim),
         )
@@ -430,7 +442,7 @@ class Run:
 
     def _find_sequence(self, whole: Outcome, interval: Interval) -> Interval | None:
         """Return the ends that hold at every look, around the interval; None where the run stops on nothing it sees."""
-        target = self._goal.target_cov or getattr(self._choice.method, "own_target", None)
+        target = self._goal.target_cov or getattr(self._named, "own_target", None)
         if target is None or not (0 < whole.p < 1 and 0 < whole.cov < math.inf):
             return None
         low, high = confidence_sequence(whole.p, whole.cov, target, self._goal.confidence)

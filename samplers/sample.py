@@ -215,6 +215,26 @@ class SimulatedPoints:
         return cls(np.concatenate(x), np.concatenate(f))
 
 
+@dataclass(frozen=True, eq=False)
+class Closest:
+    """The simulation that came closest to failure, that of the least f."""
+
+    x: FloatArray
+    """The point, shape (d,), in physical space."""
+    f: float
+    """Its outcome."""
+
+    def nearer(self, x: FloatArray, f: FloatArray) -> Closest:
+        """Return this one or the one of least f of points x (n, d), f (n,), whichever is closer; NaN is no outcome."""
+        k = int(np.argmin(np.where(np.isnan(f), np.inf, f)))
+        return Closest(x[k].copy(), float(f[k])) if f[k] < self.f else self
+
+    def __str__(self) -> str:
+        """Return f and up to six coordinates."""
+        shown = ", ".join(f"{value:.3g}" for value in self.x[:6]) + ", ..." * (len(self.x) > 6)
+        return f"f = {self.f:.3g} at x = ({shown})"
+
+
 class Failure(NamedTuple):
     """One failing point."""
 

@@ -37,7 +37,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Stepping, Steps, choose_method, offer_of
+from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Stepping, Steps, offer_of
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     NOT_KNOWN,
@@ -107,7 +107,7 @@ class _Sum:
 
     def __init__(self, method: SumOfStrata, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> None:
         self.method, self.strata, self.inputs, self.goal, self.rng = method.method, method.strata, inputs, goal, rng
-        self.plain_draws, self.chooses = method.plain_draws, hasattr(method.method, "choose")  # of `Auto`, or a user's
+        self.plain_draws, self.chooses = method.plain_draws, getattr(method.method, "chooses", False)  # as `Auto`
         nothing = replace(
             NOT_KNOWN,
             status=Status.BUDGET,
@@ -258,7 +258,7 @@ class _Sum:
         goal = replace(self.goal, max_sim=max_sim, target_cov=target_cov, on_level=tell_level)
         if method is None:
             self.searched.add(stratum)
-            method = choose_method(self.method, inputs, goal).method
+            method = self.method
         runs, outcomes = list[Replicate](), list[Outcome]()
         while not self.stopped and (not runs or needs_another(runs, method, goal, 1)):
             first = self.n_sim
@@ -283,7 +283,8 @@ class _Sum:
             self.at_limit.add(stratum)
         whole, self.behind[stratum] = self._join(part, self.behind[stratum], found, n)
         whole = replace(whole, draw_weights=tuple(replace(each, run=0) for each in whole.draw_weights))
-        methods = ", ".join(dict.fromkeys([*filter(None, part.method.split(", ")), method.name]))
+        used = method if found.chosen is None else found.chosen.method
+        methods = ", ".join(dict.fromkeys([*filter(None, part.method.split(", ")), used.name]))
         self.parts[stratum] = replace(part, outcome=whole, n_sim=part.n_sim + n, method=methods)
 
     def _join(self, part: Part, n_old: float, found: Outcome, n: float) -> tuple[Outcome, float]:

@@ -334,7 +334,7 @@ def _list_effort(report: Report, details: bool) -> Iterator[Row]:
     rows = {"c.o.v.": f"{cov}; gain {gain}", "method": f"{run}; {time}"}
     if details:
         rows = {"c.o.v.": cov, "simulations": time, "unseen": estimate.proviso, "gain": gain, "method": run}
-    chosen = {"chosen": estimate.choice} if estimate.chose_another else {}
+    chosen = {"chosen": estimate.choice} if estimate.chosen is not None and estimate.chosen.unusual else {}
     yield from ({**rows, **chosen} if details else {**rows, **chosen, "unseen": estimate.proviso}).items()
 
 

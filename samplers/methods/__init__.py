@@ -4,56 +4,60 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from samplers.method import Choice, Goal, Stepping, Steps, offer_of
-from samplers.methods.base import Method, noise_mask
+from samplers.mcmc import RootedPoints
+from samplers.method import Choice, Goal, Interrupted, Stepping, Steps, offer_of
+from samplers.methods.base import Method, marginalise_noise, noise_mask
 from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.series.method import Series
 from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
-from samplers.methods.surrogate import Surrogate
+from samplers.methods.surrogate import Surrogate, SurrogateRun
 from samplers.methods.two_stage.method import TwoStage
 from samplers.output import register_stored
 from samplers.problem import Inputs, check_name, check_settings
+from samplers.sample import Status
 
-FEW = (300, 500)
-"""Simulations of a run, from and to, for `Surrogate`. It was measured from 300 on
-(`benchmarks/results/few_simulations.json`). With 1,000 its intervals hold p in 68 and 82 % of 40 runs on the cut-ins
-(`benchmarks/results/against_truth.json`), where those of `TwoStage` hold it in 24 of 24 with 600 and with 1,000."""
-MOST_DIMS = 6
-"""Dimensions up to which `Surrogate` was measured (`benchmarks/results/few_simulations.json`)."""
+FEW = 1000
+"""Simulations up to which f is first learned by kriging; with more, `TwoStage` has the room for a search of its own."""
 LONG = 30
 """Dimensions from which `Series` takes over; with fewer the exploration of `TwoStage` misses as little."""
 ENOUGH = 1000
 """Simulations from which `Series` has room for walks, rounds and an estimate."""
 SLOW = 1.0
 """Seconds of a simulation from which on 6,000 of them are taken as too many where max_sim does not say: 100 minutes."""
-SLOW_BUDGET = 1000
-"""Simulations that are planned for then."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Auto(Method):
-    """Choice between three methods, by a rule that looks at no outcome; the default of `estimate`.
+    """Choice among the methods by budget, dimension and what f does; the default of `estimate`.
 
     1. *Terms.* `Series` where the problem offers terms and their gradients, with 30 coordinates or more and 1,000
        simulations or more.
-    2. *Budget and dimension.* `Surrogate` where a run has 300 to 500 simulations and the search at most 6 dimensions
-       (coordinates that the base distribution calls noise are not searched), `TwoStage` otherwise.
+    2. *Up to 1,000 simulations* a run begins as `Surrogate`. Its batches are predicted before they are simulated:
+
+       - In up to 20 dimensions it ends so, unless 600 simulations are left when 200 were spent and the failures of two
+         batches were never foreseen (f jumps, or fails in many regions): `TwoStage` has the rest.
+       - In more it ends so where kriging explains 40 % of the variance of f from 100 base draws (a third of the run, if
+         that is less), each predicted from the others. Else `AdaptiveSubsetSimulation` goes on from these.
+
+       More simulations are for `TwoStage`.
     3. *Cost.* Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, 1,000;
        a target c.o.v. without max_sim goes to `TwoStage`.
 
-    The budget is that of one replicate. The result is that of the method chosen, to the bit, and names it;
-    `Estimate.choice` says which and why, and so does the result's text where it is not `TwoStage`. In a sum over strata
-    every run of a stratum chooses for itself, by its own budget, after a pilot of plain draws; `Part.method` names all.
+    The budget is that of one replicate; coordinates that the base distribution calls noise are not searched, and do not
+    count as dimensions. What decided between methods does not count in p, but for the draws from which subset
+    simulation goes on: how well they are predicted decided, not how many fail. The result names the method, and
+    `Estimate.choice` says why. In a sum over strata every run of a stratum chooses for itself, after a pilot of plain
+    draws; `Part.method` names all.
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.
@@ -61,9 +65,9 @@ class Auto(Method):
     Example:
         >>> import samplers
         >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u[:, 0], dim=2)
-        >>> for max_sim in (300, 3000):
+        >>> for max_sim in (200, 3000):
         ...     print(samplers.estimate(problem, "auto", seed=0, max_sim=max_sim).choice)
-        surrogate: 300 simulations for 2 dimensions
+        surrogate: 200 simulations for 2 dimensions, failures foreseen
         two-stage: 3,000 simulations for 2 dimensions
     """
 
@@ -71,29 +75,52 @@ class Auto(Method):
 
     name: ClassVar[str] = "auto"
     stops_at_target: ClassVar[bool] = True
+    chooses: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Check the settings."""
         if self.seconds_per_simulation is not None:
             check_settings(self, seconds_per_simulation=(0.0, math.inf))
 
-    def choose(self, inputs: Inputs, goal: Goal) -> Choice:
-        """Return the method for one run, with the budget and the target of one replicate."""
-        noise = noise_mask(inputs)
-        dim = inputs.dim - (0 if noise.all() else int(np.count_nonzero(noise)))
-        slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
-        usual = SLOW_BUDGET if slow else TwoStage().n
-        budget = usual if goal.max_sim is None else goal.max_sim
-        offer = offer_of(inputs)
-        by_terms = offer is not None and offer.gradient_cost is not None and inputs.dim >= LONG and budget >= ENOUGH
-        few = FEW[0] <= budget <= FEW[1] and dim <= MOST_DIMS
-        method = Series() if by_terms else Surrogate() if few else TwoStage()
-        why = f"{method.name}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}" + " and terms" * by_terms
-        return Choice(method, why, unusual=by_terms or few)
-
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
-        """Take the steps of the method chosen."""
-        return self.choose(inputs, goal).method.steps(inputs, goal, rng)
+        """Learn f where there are few simulations, and go on by the method that suits it."""
+        slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
+        budget = (FEW if slow else TwoStage().n) if goal.max_sim is None else goal.max_sim
+        noise, offer = noise_mask(inputs), offer_of(inputs)
+        dim = inputs.dim - (0 if noise.all() else int(np.count_nonzero(noise)))
+        size = f"{budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}"
+        if offer is not None and offer.gradient_cost is not None and inputs.dim >= LONG and budget >= ENOUGH:
+            outcome = yield from Series().steps(inputs, goal, rng)
+            return replace(outcome, chosen=Choice(Series(), f"series: {size} and terms", unusual=True))
+        if budget > FEW:
+            outcome = yield from TwoStage().steps(inputs, goal, rng)
+            return replace(outcome, chosen=Choice(TwoStage(), f"two-stage: {size}"))
+        searched = marginalise_noise(inputs, rng)
+        run = SurrogateRun(searched, goal, budget, rng, may_leave=True)
+        found = yield from run.steps()
+        if found is not None:
+            how = ", failures foreseen" if run.learned else ""
+            return replace(found, chosen=Choice(Surrogate(), f"surrogate: {size}{how}", unusual=True))
+        method = AdaptiveSubsetSimulation() if run.many else TwoStage()
+        left = budget - len(run.f)
+        why = f"kriging explains {max(100 * run.skill, 0):.0f} % of f" if run.many else "failures were not foreseen"
+        choice = Choice(method, f"{method.name}: {size}, {why}; {left:,} simulations were left", unusual=True)
+        return replace((yield from _take_over(run, inputs, replace(goal, max_sim=left))), chosen=choice)
+
+
+def _take_over(run: SurrogateRun, inputs: Inputs, goal: Goal) -> Steps:
+    """Go on after a run that gave up: by subset simulation from its base draws, or by `TwoStage`."""
+    spent = len(run.f)
+    known = RootedPoints(run.u, run.f, np.arange(spent)) if run.many and run.inputs is inputs else None
+    try:
+        if run.many:
+            outcome = yield from AdaptiveSubsetSimulation().steps(inputs, goal, run.rng, known)
+        else:
+            outcome = yield from TwoStage().steps(inputs, goal, run.rng)
+    except Interrupted:
+        return run.estimate_early(Status.STOPPED)
+    weights = tuple(replace(each, first=spent + each.first) for each in outcome.draw_weights)
+    return replace(outcome, trace=(*run.simulator.trace, *outcome.trace), draw_weights=weights)
 
 
 ENTRY_POINT_GROUP = "rare_envs.samplers"

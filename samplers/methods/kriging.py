@@ -27,6 +27,7 @@ from scipy.special import log_ndtr
 
 from samplers.problem import FloatArray
 
+MANY_DIMS = 20  # In more the covariance has one length, and a linear part
 SMOOTHNESS = 2.5  # nu of the Matern covariance: f is taken as twice differentiable
 OUTCOME_SCALE = 2.0  # c of arcsinh(y / c) is this times the median of |y|
 TIE_SHARE = 0.05
@@ -71,6 +72,7 @@ class Kriging:
     inflation: float  # factor on standard deviations
     scale: float  # c of the compression of outcomes, chosen when parameters are searched for
     n_searched: int  # points when covariance parameters were last searched for
+    skill: float  # share of the variance of outcomes that is predicted of each from the others
 
     def predict(self, u: FloatArray) -> Prediction:
         """Predict at u (n, d)."""
@@ -124,7 +126,8 @@ def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> 
     inflation = min(max(inflation, 1.0), MOST_INFLATION)
     if outcomes.floored.any():  # these do not tell where f would be 0
         limit += _find_shift(left_out - limit, inflation * left_out_sd, y <= 0)
-    return Kriging(process, limit, inflation, scale, n_searched)
+    skill = 1 - float(((standard - left_out) ** 2).mean())
+    return Kriging(process, limit, inflation, scale, n_searched, skill)
 
 
 def _find_shift(mean: FloatArray, sd: FloatArray, fails: NDArray[np.bool_]) -> float:
@@ -157,11 +160,14 @@ def compress_outcomes(y: FloatArray, scale: float) -> Outcomes:
 
 
 def _initial_kernel(dim: int) -> Any:
-    """Return a Matern covariance with a length for each coordinate, and a nugget."""
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel  # slow to import
+    """Return a Matern covariance and a nugget: a length for each coordinate, or one and a linear part for many."""
+    from sklearn.gaussian_process.kernels import ConstantKernel, DotProduct, Matern, WhiteKernel  # slow to import
 
-    lengths = np.full(dim, 2.0 * math.sqrt(dim))  # about the distance between two draws
+    length = 2.0 * math.sqrt(dim)  # about the distance between two draws
+    lengths = np.full(dim, length) if dim <= MANY_DIMS else length
     smooth = ConstantKernel(1.0, (1e-2, 1e3)) * Matern(lengths, (0.2, 100.0), nu=SMOOTHNESS)
+    if dim > MANY_DIMS:
+        smooth += ConstantKernel(1.0 / dim, (1e-5, 1e2)) * DotProduct(0.0, "fixed")
     return smooth + WhiteKernel(1e-4, (1e-8, 1.0))
 
 

@@ -20,7 +20,7 @@ from samplers.mcmc import (
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.problem import Inputs, check_settings
-from samplers.sample import Layer, Level, Sample, Status, next_level
+from samplers.sample import Layer, Level, Sample, Status, clopper_pearson, next_level
 
 LONGEST_CHAIN = 50
 """More steps than this from a handful of seeds cost calls of f and add little."""
@@ -67,10 +67,12 @@ class SubsetMethod(Method, Protocol):
         first = independent_chains(u, f)._replace(n_new=len(new))
         planner = SubsetPlanner(n, self.p0, self.max_levels, gamma, goal.budget - len(new))
         status = yield from descend(inputs, first, kernel, planner.plan_next, record, rng)
-        doubts = [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if n < self.n / 2 else []
+        outcome = summarise(inputs, levels, goal, trace, status)
         if budget < n:
-            doubts = [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
-        return summarise(inputs, levels, goal, trace, status, doubts)
+            about = f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."
+            return outcome.remark_first(about)
+        few = f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."
+        return outcome.remark_first(few) if n < self.n / 2 else outcome
 
 
 class SubsetPlanner(NamedTuple):
@@ -104,24 +106,23 @@ class SubsetPlanner(NamedTuple):
 
 ACCEPTANCE_RANGE = (0.15, 0.85)
 """Acceptance without a warning: below it chains hardly move, above it their steps are short."""
-FEW_CHAINS = 20
-"""Fewer seeds than this make a level coarse: its c.o.v. is 0.2 or more."""
-LARGE_COV = 0.5
-"""C.o.v. that is worth a warning; the interval then spans a factor of 2.5 to either side."""
 
 
-def summarise(
-    inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Level], status: Status, doubts: list[str]
-) -> Outcome:
-    """Return the outcome of all levels, of the last of which `trace` counts f <= gamma."""
-    hits = levels[-1].where(levels[-1].f <= goal.gamma).f
-    cov, interval = judge_levels(levels[-1], goal, trace)
+def summarise(inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Level], status: Status) -> Outcome:
+    """Return the outcome of all levels, of the last of which `trace` counts f <= gamma.
+
+    The upper end is at most that of the base draws of level 0 alone.
+    """
+    hits, p = levels[-1].where(levels[-1].f <= goal.gamma).f, trace[-1].estimate
+    cov, (low, high) = judge_levels(levels[-1], goal, trace)
+    of_base = len(levels[0].where(levels[0].f <= goal.gamma).f)
+    most = clopper_pearson(of_base, trace[0].n_points, goal.confidence)[1]
     return Outcome(
-        p=trace[-1].estimate,
-        interval=interval,
+        p=p,
+        interval=(low, max(p, min(high, most))),
         cov=cov,
         status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
-        warnings=(*doubts, *_end_warnings(len(trace) - 1, status, len(hits), cov), *_chain_warnings(trace)),
+        warnings=(*_end_warnings(len(trace) - 1, status, len(hits)), *_chain_warnings(trace)),
         trace=tuple(trace),
         no_outcome_share=no_outcome_share(hits),
         base_draws=trace[0].n_points,
@@ -151,7 +152,7 @@ def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], ga
     )
 
 
-def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str]:
+def _end_warnings(depth: int, status: Status, hits: int) -> list[str]:
     """Return what the end of the run at level `depth` and its failures leave doubtful."""
     failing = f"{hits} failing point{'' if hits == 1 else 's'}"
     about = {
@@ -162,24 +163,17 @@ def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str
     found = [about[status]] if status in about else []
     if hits == 0:
         found.append("No failure was seen: p = 0 with a one-sided interval.")
-    elif cov > LARGE_COV:
-        found.append(f"The c.o.v. is {cov:.2f}: few independent paths lead to the failures seen.")
     return found
 
 
 def _chain_warnings(trace: list[Level]) -> list[str]:
-    """Return which levels have chains that mix badly, or few of them."""
+    """Return which levels have chains that mix badly."""
     low, high = ACCEPTANCE_RANGE
-    found = [
+    return [
         f"Acceptance {level.acceptance:.2f} at level {k} is outside [{low}, {high}]: the chains explore badly."
         for k, level in enumerate(trace)
         if level.acceptance is not None and not low <= level.acceptance <= high
     ]
-    for k, level in enumerate(trace[:-1], start=1):
-        seeds = round(level.p * level.n_points)
-        if seeds < FEW_CHAINS:
-            found.append(f"Level {k} grew from {seeds} seeds only: the estimate is coarse.")
-    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ and Deheeger 2013, who take P[fail | u] itself).
 """
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -17,22 +18,17 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtri
 
 from samplers.distributions import Gaussian
-from samplers.importance import (
-    Draws,
-    Search,
-    count_final_draws,
-    weighted_interval,
-)
+from samplers.importance import Draws, Search, count_final_draws, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise
-from samplers.methods.kriging import Kriging, Prediction, fit_kriging
-from samplers.methods.two_stage.method import run_two_stage
+from samplers.methods.kriging import MANY_DIMS, Kriging, Prediction, fit_kriging
 from samplers.methods.two_stage.regions import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Mixture, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import (
     Status,
     add_unseen,
+    clopper_pearson,
     degrees_of_freedom,
     effective_sample_size,
     log_normal_interval,
@@ -40,22 +36,16 @@ from samplers.sample import (
 )
 
 LEAST_BUDGET = 60  # With fewer simulations all are base draws
-MOST_DIMS = 20  # In more dimensions `TwoStage` takes over: distances between points say little there
 SCALES = (1.0, 1.5, 2.2, 3.0)
 """Standard deviations of the first design, a quarter each; at 3 a plane at beta = 4.5 is crossed by one in 15."""
 LEARNING_SHARE = 2 / 3  # Largest share of the budget to learn from; a third at least is left for the estimate
 MOST_LEARNING = 300  # Simulations at most: the cost of kriging grows with their cube
-RANDOM_SHARE = 0.3
-"""Share of a batch drawn at random where a surrogate that is doubted leaves both open: points far from its limit state,
-which tell whether it is right there."""
 DOUBT = 4.0
 """Factor on standard deviations of a surrogate that is not believed: points are left out at a learned limit state lie
 close together, so that their residuals say little of what is between them."""
-MOST_SURPRISE = 1.5
-"""Standard errors by which the failures of two batches may differ from those predicted where learning ends early:
-of a surrogate that is wrong at the limit state, all doubtful points fail, or none."""
 FORECAST_COV = 0.02  # Learning ends where the draws left would give this c.o.v., in two batches one after the other
 FINAL_POOL = 20_000  # Draws of the last pool; its own error is 1 / sqrt(those that may fail), a part of the c.o.v.
+LEAST_FITTED = 30  # Effective draws of a pool that a mixture is fitted to at least
 PARTS = SURROGATE, BASE, WIDE, DOUBTED = range(4)
 """Parts of a proposal: what the surrogate says, base draws, wide draws, and what it would say if it were doubted."""
 PART_SHARES = np.array([0.7, 0.1, 0.05, 0.15])
@@ -63,8 +53,7 @@ PART_SHARES = np.array([0.7, 0.1, 0.05, 0.15])
 regions that the surrogate denies, with small weights. On the IDM cut-in, 300 simulations, 10 seeds: without doubted
 draws and random points 8 of 10 intervals held p and the gain was 34; with doubted draws alone 10 and 76, with both 10
 and 190."""
-LEAST_ESS = 10.0  # Effective failing draws below which the upper end is Bernstein's bound, which is then near 1
-LEAST_SKILL = 0.5  # Share of the draws proposed by the surrogate that should fail; with less, there is a warning
+LEAST_ESS = 10.0  # Effective failing draws below which the upper end is Bernstein's bound, or that of the base draws
 
 
 class Pool(NamedTuple):
@@ -100,6 +89,15 @@ class Pool(NamedTuple):
         ratio = float(logsumexp(self.log_proposal)) - logsumexp(self.log_weights + self.prediction.log_fail)
         return float(np.sqrt(np.expm1(min(2 * ratio, 100.0)) / max(n, 1)))
 
+    def temper(self) -> FloatArray:
+        """Return the logarithms of the proposal (N,); of a smaller power of P[fail] where few carry its weight."""
+        low, high = 0.0, 0.5
+        for _ in range(12 if effective_sample_size(self.log_proposal) < LEAST_FITTED else 0):
+            power = 0.5 * (low + high)
+            enough = effective_sample_size(self.log_weights + power * self.prediction.log_fail) >= LEAST_FITTED
+            low, high = (power, high) if enough else (low, power)
+        return self.log_weights + high * self.prediction.log_fail
+
 
 def log_density_ratio(u: FloatArray, mixture: Mixture) -> FloatArray:
     """Return log(phi / Q) at u (n, d), shape (n,)."""
@@ -113,13 +111,12 @@ def isotropic_mixture(dim: int, scales: tuple[float, ...] = SCALES) -> Mixture:
 
 def fit_mixture(pool: Pool, rng: np.random.Generator) -> Mixture:
     """Return base, wide and fitted Gaussians, the last fitted to draws of the pool in proportion to the proposal."""
-    chosen = rng.choice(len(pool.u), 800, p=normalise_weights(pool.log_proposal))
-    points, dim = pool.u[chosen], pool.u.shape[1]
-    equal = np.full(len(points), 1 / len(points))
-    fitted = fit_proposal_mixture(fit_shrunk_gaussian, points, equal, 5, 3 * dim, rng)
-    n_wide = len(SCALES) - 1
+    rows, counts = np.unique(rng.choice(len(pool.u), 800, p=normalise_weights(pool.temper())), return_counts=True)
+    dim, n_wide = pool.u.shape[1], len(SCALES) - 1
+    fitted = fit_proposal_mixture(fit_shrunk_gaussian, pool.u[rows], counts / 800, 5, 3 * dim, rng)
     shares = np.array([0.2, *np.full(n_wide, 0.2 / n_wide), 0.6])
-    return Mixture(shares, [*isotropic_mixture(dim).components, fitted.widen(1.2)])
+    wider = 1 + 0.5 / math.sqrt(dim)  # log weights then vary by 0.7 whatever the dimension
+    return Mixture(shares, [*isotropic_mixture(dim).components, fitted.widen(wider)])
 
 
 class PoolProposal(NamedTuple):
@@ -151,7 +148,8 @@ def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator)
     """Choose the next n points to learn from, shape (n, d).
 
     Of candidates drawn as phi sqrt(P[fail] P[safe]) the most doubtful one by one (least |mean| / sd, Echard et al.
-    2011), each lowering the others' variances; the rest at random where a doubted surrogate leaves both open.
+    2011), each lowering the others' variances; three in ten at random where a doubted surrogate leaves both open, far
+    from its limit state, which tell whether it is right there.
     """
     log_open, most = pool.log_open, 40 * n
     weights = normalise_weights(log_open)
@@ -161,7 +159,7 @@ def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator)
     u, mean = pool.u[among], pool.prediction.mean[among]
     covariance, noise = kriging.covariance(u)
     chosen = list[int]()
-    n_random = int(RANDOM_SHARE * n)
+    n_random = int(0.3 * n)
     for _ in range(min(n - n_random, len(among))):
         doubt = -np.abs(mean) / np.sqrt(np.maximum(np.diag(covariance), 0.0) + noise + 1e-12)
         doubt[chosen] = -np.inf
@@ -174,34 +172,97 @@ def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator)
     return np.concatenate([u[chosen], pool.u[np.argsort(-keys, kind="stable")[:n_random]]])
 
 
-class SurrogateRun:
-    """One run, with what has been simulated so far; `inputs` are without coordinates that are noise."""
+class HeldOut(NamedTuple):
+    """Points (n,) that were predicted before they were simulated: P[fail], and whether they failed."""
 
-    def __init__(self, inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> None:
-        self.inputs, self.goal, self.budget, self.rng = inputs, goal, budget, rng
+    predicted: FloatArray = np.empty(0)
+    fails: NDArray[np.bool_] = np.empty(0, dtype=bool)
+
+    def add(self, predicted: FloatArray, fails: NDArray[np.bool_]) -> "HeldOut":
+        """Return these and others."""
+        return HeldOut(np.concatenate([self.predicted, predicted]), np.concatenate([self.fails, fails]))
+
+    def last(self, n: int) -> "HeldOut":
+        """Return the last n."""
+        return HeldOut(self.predicted[-n:], self.fails[-n:])
+
+    @property
+    def right(self) -> int:
+        """How many fell on the side that was predicted."""
+        return int(((self.predicted > 0.5) == self.fails).sum())
+
+    @property
+    def foreseen(self) -> bool:
+        """Whether as many failed as predicted, within 1.5 standard errors; at unforeseen jumps all do, or none."""
+        allowed = 1.5 * math.sqrt(2 * float((self.predicted * (1 - self.predicted)).sum()) + 1)
+        return abs(float(self.fails.sum() - self.predicted.sum())) <= allowed
+
+    @property
+    def misjudged(self) -> bool:
+        """Whether fewer fell on the side predicted than the predictions themselves allow, by 3 standard errors."""
+        sure = np.maximum(self.predicted, 1 - self.predicted)
+        return self.right < float(sure.sum()) - 3 * math.sqrt(float((sure * (1 - sure)).sum()) + 1)
+
+
+LEAST_SKILL = 0.4
+"""Share of the variance of f that is to be predicted of points left out, in many dimensions: with 100 base draws it is
+0.41 to 0.95 where one or two planes or a sum of claims fail, 0.28 for four planes, up to 0.13 for a ring or a first
+passage, where nothing is to be learned from a few hundred simulations."""
+LEAST_LEFT = 600
+"""Simulations that another method is to have if it takes over where f is not learned."""
+
+
+class SurrogateRun:
+    """One run, with what has been simulated so far; `inputs` are without coordinates that are noise.
+
+    Where `may_leave`, the run gives up when f is not learned and another method would do better with the rest: `steps`
+    then returns None.
+    """
+
+    def __init__(
+        self, inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, may_leave: bool = False
+    ) -> None:
+        self.inputs, self.goal, self.budget, self.rng, self.may_leave = inputs, goal, budget, rng, may_leave
         self.simulator = Simulator(inputs, goal)
         self.u, self.f = np.empty((0, inputs.dim)), np.empty(0)
-        self.n_design, self.failing_batches = 0, 0
+        self.many = inputs.dim > MANY_DIMS
+        self.scales = (1.0,) if self.many else SCALES  # of the first design; wide draws say little in many dimensions
+        size = min(budget // 3, 100) if self.many else min(budget // 4, 30 + 10 * inputs.dim)
+        self.n_base = max(size // len(self.scales), 1)
+        self.n_design, self.failing_batches = self.n_base * len(self.scales), 0
+        self.held_out, self.learned, self.skill = HeldOut(), False, 0.0
 
-    def steps(self) -> Steps:
+    def steps(self) -> Generator[FloatArray, FloatArray, Outcome | None]:
         """Learn; then estimate, or leave it to plain Monte Carlo."""
-        from scipy.stats import qmc  # takes a second to import
-
-        size = min(self.budget // 4, 30 + 10 * self.inputs.dim)
-        each = max(size // len(SCALES), 1)
-        self.n_design = each * len(SCALES)
-        cubes = [s * ndtri(qmc.LatinHypercube(self.inputs.dim, rng=self.rng).random(each)) for s in SCALES]
+        if self.budget < LEAST_BUDGET:
+            about = f"max_sim leaves {self.budget} simulations, too few to learn from ({LEAST_BUDGET}): "
+            return (yield from self.draw_base()).remark_first(about + "base draws only.")
         try:
-            yield from self._simulate(np.concatenate(cubes))
-            if (self.f[:each] <= self.goal.gamma).mean() >= 0.1:  # of base draws: plain Monte Carlo is as good
+            yield from self._simulate(self._design())
+            if (self.f[: self.n_base] <= self.goal.gamma).mean() >= 0.1:  # plain Monte Carlo is as good
                 return (yield from self.draw_base())
-            kriging, mixture = yield from self._learn()
+            kriging = fit_kriging(self.u, self.f - self.goal.gamma, None)
+            self.skill = kriging.skill
+            if self.may_leave and self.many and self.skill < LEAST_SKILL:
+                return None
+            kriging, mixture = yield from self._learn(kriging)
         except Interrupted:
-            return self._estimate_early(Status.STOPPED)
+            return self.estimate_early(Status.STOPPED)
+        if self.may_leave and not self.learned and self.budget - len(self.f) >= LEAST_LEFT:
+            return None
         if not (self.f <= self.goal.gamma).any():
             about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."
             return (yield from self.draw_base()).remark_first(about)
         return (yield from self._estimate(kriging, mixture))
+
+    def _design(self) -> FloatArray:
+        """Return the first points to simulate: Latin hypercubes of each scale, base draws alone in many dimensions."""
+        from scipy.stats import qmc  # takes a second to import
+
+        if self.many:  # subset simulation may go on with them
+            return self.rng.standard_normal((self.n_base, self.inputs.dim))
+        cubes = (qmc.LatinHypercube(self.inputs.dim, rng=self.rng).random(self.n_base) for _ in self.scales)
+        return np.concatenate([s * ndtri(cube) for s, cube in zip(self.scales, cubes, strict=True)])
 
     def draw_base(self) -> Steps:
         """Spend the rest on base draws; those of the design do not count, for they may have decided it."""
@@ -210,42 +271,40 @@ class SurrogateRun:
         draws = yield from search.draw_final(search.base, limit, max(left, 1), goal.target_cov)
         stopped = search.status is Status.STOPPED
         if draws.n == 0:
-            return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
+            return self.estimate_early(Status.STOPPED if stopped else Status.BUDGET)
         status, trace = Status.STOPPED if stopped else Status.CONVERGED, (*self.simulator.trace, *search.trace)
         return draws.outcome(goal, status, trace, 1.0, draws.n)
 
-    def _simulate(self, u: FloatArray) -> SimulationSteps[None]:
-        """Simulate u (n, d) to learn from."""
+    def _simulate(self, u: FloatArray) -> SimulationSteps[FloatArray]:
+        """Simulate u (n, d) to learn from; return their outcomes (n,)."""
         f = yield from self.simulator.evaluate(u)
         self._keep(u, f)
         self.simulator.record(float((f <= self.goal.gamma).mean()), math.nan, len(f), math.inf)
+        return f
 
     def _keep(self, u: FloatArray, f: FloatArray) -> None:
         """Learn from points u (n, d) with outcomes f (n,) too."""
         self.u, self.f = np.concatenate([self.u, u]), np.concatenate([self.f, f])
 
-    def _learn(self) -> SimulationSteps[tuple[Kriging, Mixture]]:
+    def _learn(self, kriging: Kriging) -> SimulationSteps[tuple[Kriging, Mixture]]:
         """Simulate batches where the surrogate is in doubt, until it is good enough or has its share of the budget."""
         most = min(int(LEARNING_SHARE * self.budget), MOST_LEARNING)
+        if self.may_leave and not self.many and self.budget >= LEAST_LEFT + 200:
+            most = 200
         size = max((most - self.n_design) // 16, 6)  # simulators run the points of one batch side by side
-        kriging = fit_kriging(self.u, self.f - self.goal.gamma, None)
         mixture, good = isotropic_mixture(self.inputs.dim), 0
-        surprises = list[float]()
         while len(self.f) < most and good < 2:
             pool = Pool.draw(kriging, mixture, 3000, self.rng)
-            before = int((self.f <= self.goal.gamma).sum())
             batch = choose_batch(kriging, pool, min(size, most - len(self.f)), self.rng)
-            expected = np.exp(kriging.predict(batch).log_fail)
-            yield from self._simulate(batch)
-            failures = int((self.f <= self.goal.gamma).sum())
-            surprises.append(float(failures - before - expected.sum()))
-            allowed = MOST_SURPRISE * math.sqrt(2 * float((expected * (1 - expected)).sum()) + 1)
-            calibrated = abs(sum(surprises[-2:])) <= allowed
-            self.failing_batches += failures > before
-            forecast = pool.forecast_cov(self.budget - len(self.f))
-            good = good + 1 if failures and calibrated and forecast < FORECAST_COV else 0
+            predicted = np.exp(kriging.predict(batch).log_fail)
+            fails = (yield from self._simulate(batch)) <= self.goal.gamma
+            self.held_out = self.held_out.add(predicted, fails)
+            self.failing_batches += bool(fails.any())
+            sharp = fails.any() and pool.forecast_cov(self.budget - len(self.f)) < FORECAST_COV
+            good = good + 1 if sharp and self.held_out.last(2 * size).foreseen else 0
             mixture = fit_mixture(pool, self.rng)
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging)
+        self.learned = good == 2
         return kriging, mixture
 
     def _build_proposal(self, kriging: Kriging, mixture: Mixture) -> tuple[PoolProposal, Mixture]:
@@ -261,7 +320,7 @@ class SurrogateRun:
         """
         goal, cov, status = self.goal, math.inf, Status.CONVERGED
         draws = Draws(0, np.empty(0), np.empty(0))
-        kinds = np.zeros((2, 4))  # draws and failing draws by part of the proposal
+        kinds = np.zeros((2, 4), dtype=np.int64)  # draws and failing draws by part of the proposal
         wide = self._design_log_weights()[self.f[: self.n_design] <= goal.gamma]
         left = count_final_draws(goal, len(self.f), self.budget - len(self.f))
         proposal, mixture = self._build_proposal(kriging, mixture)
@@ -288,52 +347,59 @@ class SurrogateRun:
                 kriging = fit_kriging(self.u, self.f - goal.gamma, kriging)
                 proposal, mixture = self._build_proposal(kriging, mixture)
         if draws.n == 0:
-            return self._estimate_early(status if status is Status.STOPPED else Status.BUDGET)
+            return self.estimate_early(status if status is Status.STOPPED else Status.BUDGET)
         largest = float(np.exp(logsumexp(proposal.pool.log_weights))) / (FINAL_POOL * float(PART_SHARES[BASE]))
         outcome = self._outcome(draws, cov, largest, status)
         lineages = max(count_lineages(self.failing_batches, wide), 1.0)
-        n, failing = kinds[:, SURROGATE]
-        poor = f"Only {failing:.0f} of {n:.0f} draws proposed by the surrogate failed: it fits f poorly."
+        low, high = outcome.interval[0], add_unseen(draws.p, outcome.interval[1], lineages, goal.confidence)
+        n, hits = self.n_base + kinds[0, BASE], (self.f[: self.n_base] <= goal.gamma).sum() + kinds[1, BASE]
+        if draws.ess < LEAST_ESS:  # what the base draws alone say may be more
+            high = max(draws.p, min(high, clopper_pearson(int(hits), int(n), goal.confidence)[1]))
+        held = self.held_out
+        poor = f"Kriging placed {held.right} of {len(held.fails)} new points on the right side, fewer than it promised."
         return replace(
             outcome,
-            interval=(outcome.interval[0], add_unseen(draws.p, outcome.interval[1], lineages, goal.confidence)),
-            warnings=(*outcome.warnings, *([poor] if failing < LEAST_SKILL * n else [])),
+            interval=(low, high),
+            warnings=(*outcome.warnings, *([poor] if held.misjudged else [])),
             base_draws=int(kinds[0, BASE]),
             sample=replace(draws.sample, lineages=lineages),
         )
 
     def _design_log_weights(self) -> FloatArray:
         """Return log(phi / q) of the points of the design, q the equal mixture of its scales."""
-        return log_density_ratio(self.u[: self.n_design], isotropic_mixture(self.inputs.dim))
+        return log_density_ratio(self.u[: self.n_design], isotropic_mixture(self.inputs.dim, self.scales))
 
-    def _estimate_early(self, status: Status) -> Outcome:
+    def estimate_early(self, status: Status) -> Outcome:
         """Return what the first design says, for a run that ends before its estimate."""
         n = self.n_design
         x = self.inputs.base.from_standard_normal(self.u[:n])
         draws = Draws.from_outcomes(self.f[:n], self._design_log_weights(), x, self.goal.gamma)
-        outcome = self._outcome(draws, draws.cov, float(len(SCALES)), status)
+        outcome = self._outcome(draws, draws.cov, float(len(self.scales)), status)
         return replace(outcome, draw_weights=draws.weights_after(0))
 
     def _outcome(self, draws: Draws, cov: float, largest_weight: float, status: Status) -> Outcome:
-        """Return what weighted draws say of p."""
+        """Return what weighted draws say of p; that they are few is a remark here, as it is the rule."""
         none, confidence = len(draws.f) == 0, self.goal.confidence
         if draws.ess < LEAST_ESS:
             interval = weighted_interval(draws, confidence, largest_weight, cov)
         else:
             freedom = degrees_of_freedom(draws.ess, independent=True)
             interval = log_normal_interval(draws.p, cov, confidence, freedom)
+        found = draws.outcome(self.goal, status, self.simulator.trace, largest_weight, 0)
         return replace(
-            draws.outcome(self.goal, status, self.simulator.trace, largest_weight, 0),
+            found,
             p=min(draws.p, 1.0),
             interval=interval,
             cov=cov,
             status=Status.NO_HITS if status is Status.CONVERGED and none else status,
+            warnings=found.warnings if none else (),
+            remarks=() if none else found.warnings,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surrogate(Method):
-    """Kriging as a guide and importance sampling on the simulator: for 100 to 1,500 simulations in few dimensions.
+    """Kriging as a guide and importance sampling on the simulator: for 100 to 1,000 simulations where f is smooth.
 
     1. *Learning* (`kriging.py`): a first design of Latin hypercubes of N(0, s^2 I), s = 1 to 3, then
        batches where phi sqrt(P[fail] P[safe]) is large, P by kriging; three in ten points are drawn where the surrogate
@@ -352,8 +418,10 @@ class Surrogate(Method):
     *Noise.* Coordinates that the base distribution calls noise are drawn, not learned; kriging takes what they do to f,
     and noise that is no part of x, as a nugget.
 
-    *Other methods take over*, with a remark: in more than 20 dimensions `TwoStage`, where learning meets no failure
-    and below 60 simulations plain Monte Carlo; without one where a tenth of the first base draws fails.
+    *Many dimensions.* In more than 20 the covariance has a linear part and one length, and the design is of base draws.
+
+    *Plain Monte Carlo takes over*, with a remark, where learning meets no failure and below 60 simulations; without one
+    where a tenth of the first base draws fails.
 
     Where Dubourg, Sudret and Deheeger and this implementation differ: they draw from P[fail] phi by Markov chains, we
     choose from weighted draws of a mixture, which gives independent draws; they have no base and wide draws, so that
@@ -390,12 +458,6 @@ class Surrogate(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Learn, then estimate."""
         budget = self.n if goal.max_sim is None else goal.max_sim
-        searched = marginalise_noise(inputs, rng)
-        if searched.dim > MOST_DIMS:
-            about = f"Kriging serves up to {MOST_DIMS} dimensions, not {searched.dim:,}: two-stage takes over."
-            return (yield from run_two_stage(inputs, goal, budget, rng)).remark_first(about)
-        run = SurrogateRun(searched, goal, budget, rng)
-        if budget < LEAST_BUDGET:
-            about = f"max_sim leaves {budget} simulations, too few to learn from ({LEAST_BUDGET}): "
-            return (yield from run.draw_base()).remark_first(about + "base draws only.")
-        return (yield from run.steps())
+        outcome = yield from SurrogateRun(marginalise_noise(inputs, rng), goal, budget, rng).steps()
+        assert outcome is not None  # it was not to leave
+        return outcome

@@ -37,12 +37,6 @@ def test_the_estimate_is_unbiased_whatever_the_surrogate_says(seen_as, expected)
     assert error == pytest.approx(expected * norm.sf(2.0), rel=0.3)
 
 
-def test_many_dimensions_are_left_to_two_stage():
-    result = samplers.estimate(half_space(30, 2.5).problem, samplers.Surrogate(n=100), seed=0)
-    assert result.n_sim == 100  # too few for an exploration
-    assert "two-stage takes over" in result.remarks[0]
-
-
 def run(f, dim, seed=0):
     return samplers.estimate(FunctionProblem(f, dim), "surrogate", seed=seed, max_sim=300)
 

@@ -175,7 +175,7 @@ def test_a_policy_from_there_is_estimated_there(cli: Cli, saved: Path, tmp_path:
     assert samplers.Estimate.load(tmp_path / "run" / ESTIMATE_FILE).p == answer["p"]
     assert_refused(cli(*words, "--out", tmp_path / "run"), "--force")
     text = cli(*words).stdout
-    assert text.startswith(f"highway-fast-v0, ego {saved}\nP[f <= 0] = ") and "what it holds fixed is held" in text
+    assert text.startswith(f"highway-fast-v0, ego {saved}\nP[f <= 0] ") and "what it holds fixed is held" in text
 
 
 def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
