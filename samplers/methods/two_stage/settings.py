@@ -46,7 +46,7 @@ class LINES:
     n = 24  # Lines; half of them arrive, as a rule. With 30 no c.o.v. was smaller on four problems (20 seeds each)
     acceptance = 0.3  # Share of fresh steps that shall be taken
     steps = 300  # Lines that go on, times steps taken, at most: where failures are far off, few that arrive are better
-    limit = 600  # Simulations after which all lines end
+    limit = 400  # Simulations after which all lines end; with 1,200 too few chains are left for rare failures
     many_regions = 6
     """In more than `HIGH_DIM` dimensions lines in so many regions mean a shell or a ring: chains would not relax
     there, and none are run."""
