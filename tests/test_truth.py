@@ -1,16 +1,13 @@
 """The methods against the long Monte Carlo reference in traffic (`benchmarks/results/truth.json`)."""
 
-import json
-
 import pytest
 from scipy import stats
 
 import rare_envs
 import samplers
-from benchmarks.estimators.against_truth import compare_with_truth, side_by_side
-from benchmarks.estimators.truth import TRUTH_RESULT
+from benchmarks.estimators.against_truth import compare_with_truth, read_truths
 
-TRUTH = json.loads(TRUTH_RESULT.read_text())["results"]
+TRUTH = [row for row in read_truths() if not row["stratum"]]
 
 
 def test_the_reference_is_long_and_complete() -> None:
@@ -39,13 +36,6 @@ def test_the_reference_is_what_the_simulation_gives_now(row: dict[str, float]) -
     hits = round(result.p * result.n_sim)
     test = stats.binomtest(hits, result.n_sim, row["p"])
     assert test.pvalue > 1e-4
-
-
-def test_runs_side_by_side_are_the_runs_alone() -> None:
-    problem, method = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101-gap"), samplers.CrossEntropy()
-    together = side_by_side(problem, [method.start(problem, seed=seed) for seed in range(3)])
-    assert together[1] == samplers.estimate(problem, method, seed=1)
-    assert len({result.p for result in together}) == 3
 
 
 @pytest.mark.parametrize("method", ["two-stage", "ce"])

@@ -2,11 +2,13 @@
 
     python -m benchmarks.estimators.against_truth --seeds 40
 
-For the IDM ego in both scenarios with both bases: mean over the seeds and its distance from the truth in standard
-errors (of the mean and of the truth together), how often the 95 % interval holds the truth, simulations and gain.
+For the IDM ego in four scenarios of one density, in strata of two others and in the sums over these: mean over the
+seeds and its distance from the truth in standard errors (of the mean and of the truth together), how often the 95 %
+interval holds the truth, simulations and gain.
 """
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,13 +19,15 @@ import typer
 import rare_envs
 import samplers
 from benchmarks import RESULTS
-from benchmarks.estimators.truth import TRUTH_RESULT
+from benchmarks.estimators.truth import TRUTH_RESULT, World, make_world
 from rare_envs.startup import use_one_thread
-from samplers.methods import get_method
 
 COMPARISON_RESULT = RESULTS / "against_truth.json"
 MONTE_CARLO_BUDGET = 100_000
-"""Plain Monte Carlo gets this many simulations, the others their defaults."""
+"""Plain Monte Carlo gets this many simulations, the others their defaults ..."""
+SUM_BUDGET = 20_000
+"""... and all of them this many in a sum over strata."""
+SUM = "sum"
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class TruthComparison:
 
     env_id: str
     base: str
+    """Name of the base distribution, of a stratum, or "sum"."""
     method: str
     seeds: int
     truth: float
@@ -50,6 +55,18 @@ class TruthComparison:
     """Share of results with a warning."""
 
 
+def read_truths(path: Path = TRUTH_RESULT) -> list[dict[str, Any]]:
+    """Return p of all scenarios of one density, of the strata where it is known to a tenth, and of their sums."""
+    record = json.loads(path.read_text())
+    strata, sums = record["strata"], dict[str, dict[str, Any]]()
+    for row in strata:
+        whole = sums.setdefault(row["env_id"], {**row, "stratum": SUM, "p": 0.0, "standard_error": 0.0})
+        whole["p"] += row["share"] * row["p"]
+        whole["standard_error"] = math.hypot(whole["standard_error"], row["share"] * row["standard_error"])
+    known = [row for row in strata if row["standard_error"] < 0.1 * row["p"]]
+    return [*({"stratum": "", **row} for row in record["results"]), *known, *sums.values()]
+
+
 def compare_with_truth(row: dict[str, Any], method: str, seeds: range) -> TruthComparison:
     """Repeat one method.
 
@@ -61,17 +78,17 @@ def compare_with_truth(row: dict[str, Any], method: str, seeds: range) -> TruthC
     Returns:
         The comparison.
     """
-    problem = rare_envs.DrivingProblem(row["env_id"], base=row["base"])
-    max_sim = MONTE_CARLO_BUDGET if method == "mc" else None
-    arguments = [samplers.RunArguments(seed=seed, max_sim=max_sim) for seed in seeds]
-    started = [samplers.Run(problem, get_method(method), each) for each in arguments]
-    runs = side_by_side(problem, started)
+    problem: samplers.Problem = rare_envs.DrivingProblem(row["env_id"])
+    if row["stratum"] != SUM:
+        problem, _ = make_world(World(row["env_id"], row["base"], row["stratum"]))
+    max_sim = SUM_BUDGET if row["stratum"] == SUM else MONTE_CARLO_BUDGET if method == "mc" else None
+    runs = [samplers.estimate(problem, method, seed=seed, max_sim=max_sim) for seed in seeds]
     p, truth = np.array([run.p for run in runs]), row["p"]
     error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])
     n_sim = float(np.mean([run.n_sim for run in runs]))
     return TruthComparison(
         env_id=row["env_id"],
-        base=row["base"],
+        base=row["base"] or row["stratum"],
         method=method,
         seeds=len(p),
         truth=truth,
@@ -86,27 +103,6 @@ def compare_with_truth(row: dict[str, Any], method: str, seeds: range) -> TruthC
     )
 
 
-def side_by_side(problem: samplers.Problem, runs: list[samplers.Run]) -> list[samplers.Estimate]:
-    """Finish runs together, so that the simulation sees all their points in one batch.
-
-    Each gives what `samplers.estimate` with its seed gives, ten times as soon.
-
-    Args:
-        problem: What they were started on.
-        runs: None of them done.
-
-    Returns:
-        Their estimates.
-    """
-    while live := [run for run in runs if not run.done]:
-        asked = [run.ask() for run in live]
-        f = problem.evaluate(np.concatenate(asked))
-        ends = np.cumsum([len(x) for x in asked])
-        for run, part in zip(live, np.split(f, ends[:-1]), strict=True):
-            run.tell(part)
-    return [run.result() for run in runs]
-
-
 @use_one_thread()
 def main(
     seeds: int = 40,
@@ -119,12 +115,12 @@ def main(
     chosen = method.split(",") if method else [name for name in samplers.METHODS if name != "series"]
     kept = json.loads(out.read_text())["cells"] if method and out.exists() else []
     cells = {(cell["env_id"], cell["base"], cell["method"]): cell for cell in kept}
-    for row in json.loads(TRUTH_RESULT.read_text())["results"]:
+    for row in read_truths():
         for name in chosen if env in row["env_id"] else ():
             cell = compare_with_truth(row, name, range(first_seed, first_seed + seeds))
             cells[cell.env_id, cell.base, cell.method] = asdict(cell)
             print(
-                f"{cell.env_id:25s} {cell.base:8s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "
+                f"{cell.env_id:25s} {cell.base:16s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "
                 f"z {cell.z:+.2f} "
                 f"coverage {cell.coverage:.2f} cov {cell.cov:.3f} own {cell.own_cov:.3f} n_sim {cell.n_sim:.0f} "
                 f"gain {cell.gain:.1f} warned {cell.warned:.2f}",

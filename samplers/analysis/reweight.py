@@ -159,26 +159,29 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     highest = float(log_ratios.max())
     largest = highest if math.isfinite(highest) else 0.0  # taken out, so that nothing overflows
     terms = old * np.exp(log_ratios - largest)
-    totals = np.bincount(owners, weights=terms, minlength=1).astype(np.float64)
-    ess, units, total = effective_number(terms), effective_number(totals), float(terms.sum())
+    ess, total, independent = effective_number(terms), float(terms.sum()), has_independent_points(sample)
+    units, cov = _spread_of_units(terms, owners, sample.n_units)
     if ess < MIN_POINTS or units < MIN_UNITS:
         raise ValueError(
             f"Under the new base the failing points have an effective sample size of {ess:.1f}, from {units:.1f} "
             f"independent units; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new "
             f"base, or start from a run with more failing points (it has {estimate.failures.total:,})."
         )
-    square = 1 / units - 1 / sample.n_units + (float(totals.max()) / total) ** 2
     old_units = effective_number(np.bincount(owners, weights=old).astype(np.float64))
     own = 1 / old_units - 1 / sample.n_units
-    cov = math.sqrt(max(square, 0.0)) * cov_inflation(estimate, math.sqrt(max(own, 0.0)))
+    inflation = cov_inflation(estimate, math.sqrt(max(own, 0.0)))
+    cov *= inflation
     ratio = total / float(old.sum()) * math.exp(min(max(largest, -MAX_LOG), MAX_LOG))
     p = min(1.0, estimate.p * ratio)
-    low, high = interval_of_sum(p, cov, units, has_independent_points(sample), estimate.confidence)
+    low, high = interval_of_sum(p, cov, units, independent, estimate.confidence)
     high = add_unseen(p, high, sample.lineages * min(1.0, units / old_units), estimate.confidence)
     at = np.array([estimate.gamma])
     high = float(add_unresolved(estimate, at, np.array([p]), np.array([high]), new_base)[0])
-    if estimate.on_error == "bound":
-        low *= 1 - float(terms[np.isneginf(f)].sum()) / total
+    known = np.where(np.isneginf(f), 0.0, terms)
+    if estimate.on_error == "bound" and known.sum() < total:
+        share, (own_units, own_cov) = float(known.sum()) / total, _spread_of_units(known, owners, sample.n_units)
+        ends = interval_of_sum(p * share, inflation * own_cov, own_units, independent, estimate.confidence)
+        low = min(low, ends[0]) if share > 0 else 0.0
     return Reweighted(
         p=p,
         interval=(low, high),
@@ -189,6 +192,15 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
         gamma=estimate.gamma,
         ratio=p / estimate.p,
     )
+
+
+def _spread_of_units(terms: FloatArray, owners: NDArray[np.int64], n_units: int) -> tuple[float, float]:
+    """Return the effective units behind a sum of terms (k,) of these units (k,), and its c.o.v.; 0 and inf of none."""
+    totals = np.bincount(owners, weights=terms, minlength=1).astype(np.float64)
+    units = effective_number(totals)
+    if units == 0:
+        return 0.0, math.inf
+    return units, math.sqrt(max(1 / units - 1 / n_units + float(totals.max() / totals.sum()) ** 2, 0.0))
 
 
 def _check_strata(base: object, new_base: object) -> None:

@@ -15,7 +15,7 @@ from benchmarks.estimators.against_truth import TruthComparison
 from benchmarks.estimators.highway import gains
 from benchmarks.estimators.highway import truth as highway_truth
 from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS, HighwayCase
-from benchmarks.estimators.truth import ROLLOUT_CHUNK, count_collisions, truth
+from benchmarks.estimators.truth import ROLLOUT_CHUNK, World, count_collisions, truth
 from rare_envs.simulation.world import rollout
 
 
@@ -28,11 +28,17 @@ def read_rows(path: Path, key: str = "rows") -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 def test_counts_are_those_of_the_chunks_whatever_the_processes() -> None:
-    world, rest = ("rare_envs/CarFollowing-v0", "highway"), 5000
-    found = truth(*world, ROLLOUT_CHUNK + rest, seed=7, workers=2)
-    parts = [count_collisions(*world, 7, chunk, size) for chunk, size in enumerate((ROLLOUT_CHUNK, rest))]
+    world, rest = World("rare_envs/CarFollowing-v0", "highway"), 5000
+    found = truth(world, ROLLOUT_CHUNK + rest, seed=7, workers=2)
+    parts = [count_collisions(world, 7, chunk, size)[0] for chunk, size in enumerate((ROLLOUT_CHUNK, rest))]
     assert found["collisions"] == sum(parts)
     assert found["p"] == sum(parts) / (ROLLOUT_CHUNK + rest)
+
+
+def test_wide_draws_give_the_p_of_plain_ones() -> None:
+    """2.6e-4 by 300 million rollouts; 1.6 times as wide some 300 of 4,000 draws collide."""
+    found = truth(World("rare_envs/CarFollowing-v0", "highway", wide=1.6), 20_000, seed=1)
+    assert abs(found["p"] - 2.583e-4) < 4 * found["standard_error"] < 0.5 * found["p"]
 
 
 def test_counts_on_the_highway_are_those_of_the_torch_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +101,7 @@ def test_rows_of_one_method_or_environment_are_made_anew_and_the_others_stay(
     assert [cell["method"] for cell in after] == [cell["method"] for cell in before]
     calls.clear()
     against_truth.main(seeds=2, env="CutIn", method="mc", out=tmp_path / "one.json")
-    assert {env_id for env_id, _ in calls} == {"rare_envs/CutIn-v0"}
+    assert {env_id for env_id, _ in calls} == {"rare_envs/CutIn-v0", "rare_envs/CutIn-v1"}
 
 
 HIGHWAY_RUNS: list[dict[str, Any]] = [
