@@ -109,53 +109,8 @@ class LiftedComponent:
 
 
 @dataclass(frozen=True, eq=False)
-class HalfSpaceNormal:
-    """N(0, I) beyond a plane, axis . u >= start, with a unit vector (d,): best for failure in a half-space."""
-
-    axis: FloatArray
-    start: float
-
-    def log_ratio(self, u: FloatArray) -> FloatArray:
-        """Return the logarithm of 1 / Phi(-start) beyond the plane, -inf before it."""
-        return np.where(u @ self.axis >= self.start, -float(log_ndtr(-self.start)), -np.inf)
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n points."""
-        xi = rng.standard_normal((n, len(self.axis)))
-        t = -ndtri_exp(np.log1p(-rng.random(n)) + log_ndtr(-self.start))
-        return np.asarray(xi + np.outer(t - xi @ self.axis, self.axis))
-
-
-@dataclass(frozen=True, eq=False)
-class HalfSpaceUnion:
-    """N(0, I) beyond one of several planes, each in proportion to its probability, for a series system of them.
-
-    The density is phi(u) k(u) / sum_j Phi(-start_j), where u is beyond k(u) of the planes (Au and Beck, "First
-    excursion probabilities for linear systems by very efficient importance sampling", Probabilistic Engineering
-    Mechanics 16, 2001). Axes are unit vectors (k, d), starts (k,) the distances of the planes from the origin.
-    """
-
-    axes: FloatArray
-    starts: FloatArray
-
-    def log_ratio(self, u: FloatArray) -> FloatArray:
-        """Return log k(u) less the logarithm of the sum of the half-spaces' probabilities."""
-        beyond = np.count_nonzero(u @ self.axes.T >= self.starts, axis=1)
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(beyond) - logsumexp(log_ndtr(-self.starts)))
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n points."""
-        log_p = log_ndtr(-self.starts)
-        chosen = rng.choice(len(self.starts), n, p=np.exp(log_p - logsumexp(log_p)))
-        axes, xi = self.axes[chosen], rng.standard_normal((n, self.axes.shape[1]))
-        t = -ndtri_exp(np.log1p(-rng.random(n)) + log_p[chosen])
-        return np.asarray(xi + (t - (xi * axes).sum(axis=1))[:, None] * axes)
-
-
-@dataclass(frozen=True, eq=False)
 class HalfSpaceIntersection:
-    """A corner, the points beyond all of several planes: N(0, 1) cut to it, one coordinate after the other.
+    """The half-space beyond a plane, or the corner beyond several: N(0, 1) cut to it, one coordinate after the other.
 
     In orthonormal coordinates t, of which the first k span the axes in their order, plane i asks for t_i >= low_i,
     where low_i depends on the coordinates before it (Genz, "Numerical computation of multivariate normal

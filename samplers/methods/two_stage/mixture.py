@@ -37,15 +37,14 @@ from samplers.methods.two_stage.settings import FIT, HIGH_DIM
 from samplers.problem import FloatArray
 from samplers.sample import normalise_weights
 
-Kind = Literal["base", "radial", "gaussian", "linear", "corner", "explored", "tempered", "spread", "directional"]
+Kind = Literal["base", "radial", "gaussian", "linear", "explored", "tempered", "spread", "directional"]
 """Where a component of a proposal comes from:
 
     base        N(0, I), which bounds all weights
     directional a direction and a radius, for failures like a shell or a cone
     radial      every direction alike, from the radius of the failures on
     gaussian    fitted to weighted failures
-    linear      a half-space and its Gaussian, from linear regression of f
-    corner      N(0, I) beyond all of several planes, from regression of f as the greatest of linear functions
+    linear      N(0, I) beyond a plane, or all of several, from regression of f as the greatest of linear functions
     explored    fitted to the chains of the exploration, never changed
     tempered    q^t phi^(1 - t) of a Gaussian q, which bounds weights where q is a bad description
     spread      as wide as the failures in the span of a few gradients of f, N(0, 1) across it

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.components import (
-    HalfSpaceUnion,
     IsotropicNormal,
     LiftedComponent,
     SubspaceGaussian,
@@ -22,12 +21,7 @@ from samplers.components import (
     log_ratios,
 )
 from samplers.methods.base import ComponentDraws
-from samplers.methods.two_stage.edges import (
-    half_space_proposals,
-    intersection_of_half_spaces,
-    union_of_half_spaces,
-    weighted_quantile,
-)
+from samplers.methods.two_stage.edges import half_spaces, weighted_quantile
 from samplers.methods.two_stage.mixture import (
     NO_REGION,
     Floor,
@@ -88,7 +82,7 @@ class RefinementState:
     gaussians: list[SubspaceGaussian]
     """The same, moved to the weighted failures: one for each of `explored`."""
     linear: tuple[ProposalComponent, ...]
-    """Half-spaces and corners from linear regression of f around each region, and of its pieces in the slopes' span."""
+    """Half-spaces and corners from regression of f around each region, none where `within` has them."""
     rounds: tuple[NearDraws, ...] = ()
     within: "RefinementState | None" = None
     """The same in the coordinates of the slopes, where the exploration has found some."""
@@ -115,8 +109,7 @@ def start_refinement(exploration: ExplorationResult, gamma: float, rng: np.rando
     axes = exploration.slopes
     if axes is None or axes.shape[1] == 0:
         return state
-    within = _describe_regions(exploration.within(axes), gamma, rng)
-    return replace(state, within=_add_pieces(within, rng))
+    return replace(state, within=_describe_regions(exploration.within(axes), gamma, rng))
 
 
 def _describe_regions(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> RefinementState:
@@ -127,10 +120,11 @@ def _describe_regions(exploration: ExplorationResult, gamma: float, rng: np.rand
         for k, region in enumerate(exploration.regions)
         for gaussian in _fit_chains(region, most, rng)
     )
+    sloped = exploration.slopes is not None and exploration.slopes.shape[1] > 0  # f is regressed among the slopes
     linear = tuple(
-        proposal
-        for k, region in enumerate(exploration.regions)
-        for proposal in _propose_edges(k, region.points, region.u, region.f, gamma)
+        ProposalComponent(proposal, "linear", k)
+        for k, region in enumerate([] if sloped or exploration.noisy else exploration.regions)
+        for proposal in half_spaces(region.points, region.u, region.f, gamma)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
     return RefinementState(exploration=exploration, gamma=gamma, explored=explored, gaussians=gaussians, linear=linear)
@@ -160,22 +154,12 @@ def _learn(
     axes, within = state.exploration.slopes, state.within
     if axes is not None and within is not None:
         within = _learn(within, history.within(axes), draws.within(axes), rng)
-        within = _add_pieces(within, rng)
     state = replace(state, rounds=(*state.rounds, draws), within=within)
     if len(history.u) < 6:  # too few to move anything
         return state
     return replace(
         state, gaussians=refit_components(state.gaussians, history.u, history.log_weights), linear=_fit_linear(state)
     )
-
-
-def _add_pieces(state: RefinementState, rng: np.random.Generator) -> RefinementState:
-    """Return the state with the half-spaces of a piecewise linear f, where f is one, beside its other proposals."""
-    known = [(region.u, region.f) for region in state.regions] + [(draws.u, draws.f) for draws in state.rounds]
-    u, f = np.concatenate([points for points, _ in known]), np.concatenate([outcomes for _, outcomes in known])
-    union = union_of_half_spaces(u, f, state.gamma, rng)
-    others = tuple(one for one in state.linear if not isinstance(one.component, HalfSpaceUnion))
-    return replace(state, linear=others if union is None else (*others, ProposalComponent(union, "linear")))
 
 
 def typical_weights(state: RefinementState, proposal: MixtureProposal, history: MultipleImportanceSample) -> FloatArray:
@@ -233,7 +217,9 @@ def _fit_chains(region: Region, most: int, rng: np.random.Generator) -> list[Sub
 
 
 def _fit_linear(state: RefinementState) -> tuple[ProposalComponent, ...]:
-    """Return half-space proposals from what was known of each region and the draws nearest to it."""
+    """Return half-spaces and corners from what was known of each region and the draws nearest to it."""
+    if state.within is not None or state.exploration.noisy:
+        return ()
     u, f = np.concatenate([draws.u for draws in state.rounds]), np.concatenate([draws.f for draws in state.rounds])
     owner, log_r = nearest_regions(state, u)
     owner = np.where(log_r > 1.0, owner, NO_REGION)  # the densest Gaussian of its own is e times phi or more
@@ -243,18 +229,9 @@ def _fit_linear(state: RefinementState) -> tuple[ProposalComponent, ...]:
         own = owner == k
         failures = np.concatenate([region.points, u[own & fails]])
         around, outcomes = np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]])
-        proposals += _propose_edges(k, failures, around, outcomes, state.gamma)
+        found = half_spaces(failures, around, outcomes, state.gamma)
+        proposals += [ProposalComponent(component, "linear", k) for component in found]
     return tuple(proposals)
-
-
-def _propose_edges(
-    region: int, failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
-) -> list[ProposalComponent]:
-    """Return proposals from regression of f (n,) at u (n, d) around a region: a half-space, and a corner of several."""
-    half_spaces = half_space_proposals(failures, u, f, gamma)
-    corner = intersection_of_half_spaces(u, f, gamma)
-    proposals = [ProposalComponent(component, "linear", region) for component in half_spaces]
-    return proposals if corner is None else [*proposals, ProposalComponent(corner, "corner", region)]
 
 
 def build_proposal(
@@ -279,7 +256,7 @@ def build_proposal(
     weights = minimise_second_moment(log_r, log_w, weights, floors)
     keeps = kinds == "base"
     if not final:
-        explored = np.isin(kinds, ["explored", "linear", "corner", "spread"])
+        explored = np.isin(kinds, ["explored", "linear", "spread"])
         weights = np.where(explored, np.maximum(weights, 0.01), weights)  # kept until the last round
         keeps = keeps | explored
     weights = np.where((weights < 0.004) & ~keeps, 0.0, weights)

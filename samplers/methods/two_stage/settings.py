@@ -121,7 +121,6 @@ class PROPOSAL:
         "radial": 0.1,
         "gaussian": 0.5,
         "linear": 0.5,
-        "corner": 0.3,
         "explored": 0.2,
         "tempered": 0.25,
         "spread": 0.2,
@@ -156,78 +155,20 @@ class DOUBT:
     max_unseen_share = 0.3  # Share of p that may be in regions that were not found
 
 
-class LINEAR_MODEL:
-    """Robust regression of f, and half-spaces beyond its hyperplane (`edges.py`)."""
+class PLANES:
+    """Half-spaces and corners from regression of f around a region (`edges.py`)."""
 
-    ridges = (1.0, 1e-3)  # Ridge penalties; the smaller one is tried where points are enough for ordinary regression
-    lad_iterations = 12  # Steps of iteratively reweighted least squares towards least absolute deviations
-    lad_smoothing = 1e-3
-    """Share of the median deviation added to each before it divides: exact points have no infinite weight."""
-    min_left_out = 1e-3  # Least 1 - leverage that divides: a point that alone decides on a slope has leverage 1
-    min_left_out_lad = 1e-2  # The same for least absolute deviations: one such point must not hold all the weight
-    inlier_sigmas = 3.0  # Standard deviations up to which a point agrees with a hyperplane (Rousseeuw and Leroy: 2.5)
-    min_points = 5  # Points that a regression needs
-    min_points_per_dim = 1.2  # With `min_points` + so many per dimension the small ridge and outliers can be judged
-    trimmed_share = 0.02  # Share of the outcomes left out at either end: f may be capped or wild there
-    exact_r2 = 0.999  # R^2 from which f is linear
+    inlier_sigmas = 3.0  # Standard deviations up to which a point agrees with its piece (Rousseeuw and Leroy: 2.5)
+    agreeing_share = 0.6  # Share of the points that must agree: over half, for two regions may have half each
+    exact_r2 = 0.999  # R^2 from which f is what the pieces say
     boundary_r2 = 0.95
-    """R^2 from which the hyperplane, or the planes of a corner, locate the failure boundary. Corners down to 0.8 bought
-    nothing: with 0.98 for 0.8 the variance was 0.996 +- 0.05 times as large (67 runs on the 14 limit states with such
-    ones), and with 0.95 for 0.98 0.97 +- 0.02 times, on drive_d6 0.92 (20 runs on five)."""
-    min_r2 = 0.3
-    """R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_hyperplane`). At 0.15
-    no run differs, at 0.6 variance 0.97 +- 0.03."""
-    agreeing_share = 0.6
-    """Share of the points that must agree with a hyperplane: over half, for two regions may have half each."""
-    crossing_errors = 2.0  # Standard errors of a prediction by which a half-space begins before the hyperplane
-    nearest_share = 0.03
-    """Share of the failures that may lie before the edge where no hyperplane locates it: none of 33."""
-    min_failures = 8
-    """Failures that half-spaces need: `failure_edge` takes a quarter of the mean excess off the least of 8."""
-    same_region_share = 0.5  # Failures nearer along the axis than this share of the median are another region's
-    widening = 1.3
-    """Variance of the Gaussian over that of N(0, 1) beyond the edge: too small a one makes weights unbounded."""
-
-
-class PIECES:
-    """f as the least of linear functions (`edges.py`)."""
-
-    n = 24  # Pieces to start with; on oscillator_d100 10 to 20 of them are left
-    iterations = 20  # Regressions of each piece: by then hardly a point changes its piece
-    points_per_dim = 2  # A piece starts from so many points per dimension ...
-    least_points = 6  # ... and so many more; it is given up with fewer than one per dimension and these.
-    first_ridge = 0.3  # Ridge penalty of the first regressions, which rest on few points
-    crossing_errors = 4.0
-    """Standard deviations of its residuals by which a half-space begins before its plane. With 2 and 3 the intervals
-    held p in 90 and 88 % of 60 runs on oscillator_d100, for the slopes leave out some of the direction of a plane; with
-    4 in all of them, at the same gain."""
-    min_r2 = 0.8
-    """R^2 under which f is no least of linear functions. It is 0.93 to 0.98 on oscillator_d100, 0.81 to 0.91 on
-    duffing_d60, and negative on screen_d40, where f is the largest of three."""
-    highest = 0.1  # Share of the outcomes left out at the upper end: what f is far from failure does not matter
-
-
-class CORNER:
-    """f as the greatest of linear functions (`edges.py`)."""
-
-    n = 6  # Pieces to start with
-    starts = 3  # Fits from other points at most, until one explains f ...
-    promising_r2 = 0.9  # ... where the first one has this R^2: the corners of screen_d40 had 0.94 and more.
-    patience = 4  # Steps of a fit without a gain that end it; with 3, two corners of 16 of common3_d9 were lost
-    points_per_dim = 100  # Points of a fit per dimension at most, evenly spaced: more show the same planes
+    """R^2 from which pieces locate the failure boundary. Corners down to 0.8 bought nothing: with 0.98 for 0.8 the
+    variance was 0.996 +- 0.05 times as large, and with 0.95 for 0.98 0.97 +- 0.02 times."""
+    min_r2 = 0.3  # R^2 under which a hyperplane is no help: at 0.15 no run differs, at 0.6 variance 0.97 +- 0.03
+    crossing_errors = 2.0  # Standard errors of a prediction by which a half-space begins before its plane
+    nearest_share = 0.03  # Share of the failures that may lie before the edge where no plane locates it: none of 33
+    min_failures = 8  # Failures that half-spaces need: `failure_edge` takes a quarter of the mean excess off 8 of them
+    pieces = 6  # Pieces of a corner to start with
+    points_per_dim = 100  # Points of a fit per dimension at most: more show the same planes
     min_start = -1.0  # Planes nearer than this hold 84 % of N(0, I) or more: the corner is hardly larger without them
-    min_turn = 0.1  # Sine of the least angle between a plane and the span of those before it: two at less are one
-
-
-class EDGES:
-    """Where proposals with an edge begin (`mixture.py`, and the planes of the regressions)."""
-
     min_distance = 0.5  # Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well
-    slack = 0.02  # By how much a half-space begins before the edge, in standard deviations of N(0, I)
-    mean_excesses = 2.0  # Mean excesses over the quantile, over the number of failures, by which an edge is put back
-    min_ess = 2.0  # Least number of failures that they are divided by
-    radius_share = 0.01  # Share of the failures' weight that may lie within the radius before it is shortened
-    radius_factor = 0.98
-    """|u|^2 there, times this, is where radial draws begin: the least of few lies beyond the edge of many."""
-    min_radial_shape = 0.3
-    """Least shape of the Gamma distribution of |u|^2: with less, nearly all draws are at its start."""
