@@ -114,7 +114,7 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
         return []
     fits = list[Pieces]()
     for rows in (np.arange(len(y)), np.flatnonzero(y >= 0), np.flatnonzero(y < 0)):
-        some = rows[_spread(len(rows), PLANES.points_per_dim * u.shape[1])]
+        some = rows[_spread(len(rows), 100 * u.shape[1])]
         sample = _scale(u[some], y[some])
         for fit in (_fit_plane, _fit_corner):
             found = None if sample is None or (fits and fits[-1].are_whole()) else fit(sample)

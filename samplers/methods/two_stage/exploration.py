@@ -211,7 +211,7 @@ def walk_lines(
         if arrived.mean() >= 0.6 and time >= 2 * float(np.median(arrival[arrived])):
             break
         on = np.flatnonzero(~arrived)
-        on = on[on < max(1, scale * LINES.steps / max(time, 1))]
+        on = on[on < max(1, scale * 300 / max(time, 1))]
         if len(on) == 0:
             break
         xi = np.where(gained[on, None], kept[on], rng.standard_normal((len(on), u.shape[1])))
@@ -258,7 +258,7 @@ def contract(
     """
     u, dim = u.copy(), u.shape[1]
     size = np.full(len(u), dim // 2)
-    for _ in range(EXPLORATION.contractions if dim > 1 else 0):
+    for _ in range(8 if dim > 1 else 0):
         far = np.flatnonzero((u**2).sum(axis=1) > dim + 2 * math.sqrt(2 * dim) + 40)
         shorter = _drop_directions(u[far], size[far], rng)
         fails = (yield from simulator.evaluate(shorter)) <= gamma

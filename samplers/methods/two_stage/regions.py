@@ -164,6 +164,7 @@ def _run_chains(
     """Move chains from failing points (n, d) inside the failure region by pCN, each with its own step.
 
     The proposal sqrt(1 - sigma^2) u + sigma xi, xi ~ N(0, I), leaves N(0, I) invariant; it is accepted if it fails.
+    sigma is adapted to an acceptance of 0.35 (Papaioannou and others, 2015: 0.44).
     """
     sigma, states, proposals, outcomes = np.full(len(u), 0.5), [], [], []
     for step in range(1, steps + 1):
@@ -171,7 +172,7 @@ def _run_chains(
         f = yield from simulator.evaluate(proposal)
         fails = f <= gamma
         u = np.where(fails[:, None], proposal, u)
-        sigma = np.clip(sigma * np.exp(0.7 * (fails - REGIONS.acceptance) / math.sqrt(step)), 0.02, 1.0)
+        sigma = np.clip(sigma * np.exp(0.7 * (fails - 0.35) / math.sqrt(step)), 0.02, 1.0)
         states.append(u)
         proposals.append(proposal)
         outcomes.append(f)

@@ -36,7 +36,6 @@ class EXPLORATION:
     """Failures among the base draws from which on no level is begun, and the second round counts in p: chains start
     from these failures, and one round shows how to describe what is so common."""
     starts = 24  # Chains from wide failures at most; as many more from failures of the lines and the levels
-    contractions = 8  # Tries to bring a start that is unlikely by its length to a likely one
     share = 0.65  # Share of the budget for the whole exploration
 
 
@@ -45,7 +44,6 @@ class LINES:
 
     n = 24  # Lines; half of them arrive, as a rule. With 30 no c.o.v. was smaller on four problems (20 seeds each)
     acceptance = 0.3  # Share of fresh steps that shall be taken
-    steps = 300  # Lines that go on, times steps taken, at most: where failures are far off, few that arrive are better
     limit = 400  # Simulations after which all lines end; with 1,200 too few chains are left for rare failures
     many_regions = 6
     """In more than `HIGH_DIM` dimensions lines in so many regions mean a shell or a ring: chains would not relax
@@ -57,7 +55,6 @@ class REGIONS:
 
     steps = 12  # Steps of the chains
     steps_high_dim = 16  # The same above `HIGH_DIM` dimensions, where a wide failure has further to go
-    acceptance = 0.35  # Acceptance that the step is adapted to; Papaioannou and others, 2015, adapt to 0.44
     noisy_share = 0.9  # Where less than this share of points right beside failing ones fail, f is noisy
     most = 16  # Regions that are separated at most
     many = 8  # Number of regions from which on failure may be something like a shell
@@ -169,6 +166,5 @@ class PLANES:
     nearest_share = 0.03  # Share of the failures that may lie before the edge where no plane locates it: none of 33
     min_failures = 8  # Failures that half-spaces need: `failure_edge` takes a quarter of the mean excess off 8 of them
     pieces = 6  # Pieces of a corner to start with
-    points_per_dim = 100  # Points of a fit per dimension at most: more show the same planes
     min_start = -1.0  # Planes nearer than this hold 84 % of N(0, I) or more: the corner is hardly larger without them
     min_distance = 0.5  # Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well
