@@ -198,10 +198,7 @@ def run_replication(job: ReplicationJob) -> Run:
 
 def _count_final(result: Estimate) -> int:
     """Return the draws that have a weight in p; all simulations where the points of chains stand for each other."""
-    weighted = result.draw_weights
-    if not weighted and isinstance(result.method, TwoStage) and result.sample is not None:
-        return result.sample.n_units  # the search by terms weights points of its own
-    return sum(len(part.log_weights) for part in weighted) or result.n_sim
+    return sum(len(part.log_weights) for part in result.draw_weights) or result.n_sim
 
 
 def _thin_trace(result: Estimate) -> list[list[float]]:

@@ -37,7 +37,7 @@ __all__ = ["write_html_report"]
 
 BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
 """Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
-SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
+SIZED_BY_BUDGET = ("mc", "is", "two-stage", "series", "surrogate")
 """Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
 
 

@@ -1,15 +1,25 @@
 """Series: failures of a least over terms, by walks along their gradients."""
 
-from dataclasses import dataclass
-from typing import ClassVar
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from samplers.method import Goal, Steps, offer_of
-from samplers.methods.base import Method
-from samplers.methods.series.search import search_terms
-from samplers.methods.series.settings import ROUNDS
-from samplers.problem import Inputs, check_settings
+from samplers.components import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
+from samplers.importance import Draws, weighted_interval
+from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, offer_of, request_terms
+from samplers.methods.base import Method, RunContext, SimulationSteps
+from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
+from samplers.methods.series.settings import ROUNDS, WALKS
+from samplers.methods.series.walks import TermSimulator, plan_walks, walk_downhill
+from samplers.methods.subset import spend_on_subset_simulation
+from samplers.problem import FloatArray, Inputs, check_settings
+from samplers.sample import DrawWeights, Status, binomial_cov, clopper_pearson
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +40,8 @@ class Series(Method):
     Each p_r is unbiased given what came before it: wrong terms or gradients cost accuracy, not truth. Failures of terms
     without a proposal of their own that carry more than 5 % of p give a warning. Where a tenth of the base draws fails,
     plain Monte Carlo takes over, and where no proposal describes the failures, adaptive subset simulation in the order
-    of the terms; a remark says so. Gradients count as simulations at what they cost. Other problems, and coordinates
-    that are noise, are those of `TwoStage`; noise is searched here like the rest of x.
+    of the terms; a remark says so. Gradients count as simulations at what they cost. Coordinates of noise are searched
+    like the rest of x.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches are added until it is
@@ -41,14 +51,11 @@ class Series(Method):
         Two half-spaces in 100 dimensions, p = 1 - (1 - Phi(-3.5))^2 = 4.65e-4:
 
         >>> import numpy as np, samplers
-        >>> problem = samplers.FunctionProblem(
-        ...     dim=100,
-        ...     terms=lambda x: 3.5 - x[:, :2],
-        ...     gradient=lambda x, term: -np.eye(100)[term],
-        ... )
+        >>> terms, gradient = (lambda x: 3.5 - x[:, :2]), (lambda x, term: -np.eye(100)[term])
+        >>> problem = samplers.FunctionProblem(dim=100, terms=terms, gradient=gradient)
         >>> result = samplers.estimate(problem, samplers.Series(n=2000), seed=0)
-        >>> result.n_sim, f"{result.p:.1e}", result.cov < 0.05
-        (2000, '4.7e-04', True)
+        >>> result.n_sim, f"{result.p:.0e}", result.cov < 0.05
+        (2000, '5e-04', True)
 
     References:
         Cappé, Douc, Guillin, Marin and Robert, "Adaptive importance sampling in general mixture classes", Statistics
@@ -56,8 +63,6 @@ class Series(Method):
         Uribe, Papaioannou, Marzouk and Straub, "Cross-entropy-based importance sampling with failure-informed dimension
         reduction for rare event simulation", SIAM/ASA Journal on Uncertainty Quantification 9, 2021 (subspaces of
         gradients).
-        Veach and Guibas, "Optimally combining sampling techniques for Monte Carlo rendering", SIGGRAPH 1995 (balance
-        heuristic).
     """
 
     n: int = 6000
@@ -74,6 +79,265 @@ class Series(Method):
         offer = offer_of(inputs)
         if offer is None or offer.gradient_cost is None:
             raise ValueError(
-                "Series needs a problem with `terms` and `gradient` (see `samplers.Problem`); 'auto' does not."
+                "Series needs `terms` and `gradient` of the problem (see `samplers.Problem`); 'auto' does not."
             )
         return search_terms(inputs, offer, goal, self.n if goal.max_sim is None else goal.max_sim, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class FinalRound:
+    """Draws of one proposal that p rests on."""
+
+    draws: Draws  # weighted as draws of their own proposal
+    variance: float  # of their p
+    other: float  # their p in failures whose least term was not pursued, and in points without an outcome
+    first: int  # simulations that the run had spent before the first of them
+    factor: float = 1.0  # weight of one of them in p, relative to other rounds
+
+
+def stratified_variance(y: FloatArray, counts: NDArray[np.int64]) -> float:
+    """Return the variance of the mean of y (n,), of which the first counts_0 are from one stratum, and so on.
+
+    Of fewer than 5 draws the second moment stands in for it. The square of the largest y is added for draws as heavy.
+    """
+    parts = np.split(y, np.cumsum(counts)[:-1])
+    within = sum(len(part) * part.var(ddof=1) if len(part) >= 5 else (part**2).sum() for part in parts)
+    return float(within + y.max(initial=0.0) ** 2) / len(y) ** 2
+
+
+class CombinedRounds(NamedTuple):
+    """Final rounds as one estimate: p = sum_r c_r p_r, c_r proportional to the draws times their factor."""
+
+    shares: FloatArray  # c_r
+    parts: list[Draws]  # of the rounds, weighted so that all of them are as draws from one proposal, with the same p
+    draws: Draws  # all of these
+    cov: float  # of p, inf where it is 0, from the larger of the variances within the rounds and between them
+
+
+def combine_rounds(rounds: tuple[FinalRound, ...]) -> CombinedRounds:
+    """Return the estimate of some final rounds, at least one."""
+    n, size = np.array([one.draws.n for one in rounds]), np.array([one.draws.n * one.factor for one in rounds])
+    c = size / size.sum()
+    parts = []
+    for one, by in zip(rounds, np.log(c * n.sum() / n), strict=True):
+        failing, safe = one.draws.log_weights + by, one.draws.log_weights_safe + by
+        parts.append(replace(one.draws, log_weights=failing, log_weights_safe=safe))
+    draws = reduce(Draws.join, parts)
+    within = float(c**2 @ [one.variance for one in rounds])
+    between = ROUNDS.between_factor * float(c**2 @ (np.array([one.draws.p for one in rounds]) - draws.p) ** 2)
+    return CombinedRounds(c, parts, draws, math.sqrt(max(within, between)) / draws.p if draws.p > 0 else math.inf)
+
+
+def order_by_terms(steps: Steps, gamma: float) -> Steps:
+    """Run steps with the least term in place of f; the outcome's points have f again.
+
+    Values are <= gamma just where f is. Where f is no better than a flag (a collision is -1, however it happened) the
+    least term tells near from far. Layers are left out: they are thresholds of the order, not of f.
+    """
+    f_of: dict[float, float] = {}
+    above = float(np.nextafter(gamma, np.inf))
+    send, answer = cast(Callable[[Any], FloatArray], steps.send), cast(Any, None)
+    while True:
+        try:
+            x = send(answer)
+        except StopIteration as end:
+            outcome: Outcome = end.value
+            break
+        send = steps.send
+        try:
+            terms = yield from request_terms(x)
+        except Interrupted as interruption:
+            send, answer = steps.throw, interruption
+            continue
+        shifted = terms.lowest - terms.threshold + gamma
+        answer = np.where(terms.f <= gamma, np.minimum(shifted, gamma), np.maximum(shifted, above))
+        answer[np.isneginf(terms.f)] = -np.inf
+        f_of.update(zip(answer.tolist(), terms.f.tolist(), strict=True))
+    if outcome.sample is None:
+        return outcome
+    f = np.array([f_of.get(value, value) for value in outcome.sample.f.tolist()])
+    return replace(outcome, sample=replace(outcome.sample, f=f, layers=()))
+
+
+SeriesRun = RunContext[TermSimulator]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SeriesState:
+    """Draws so far, and the terms that are pursued."""
+
+    history: TermHistory
+    n_base: int  # base draws before the walks, and ...
+    base_failures: int  # ... those of them that fail
+    base_draws: int  # in all
+    pursued: tuple[PursuedTerm, ...] = ()
+    finals: tuple[FinalRound, ...] = ()
+    last_rate: float = 0.0  # effective failures for each draw of the last round
+
+
+def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
+    """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
+    open_ended = goal.max_sim is None and goal.target_cov is not None
+    end = budget + 100 * ROUNDS.target_batch if open_ended else budget
+    run = SeriesRun(inputs, TermSimulator(inputs, offer, goal), goal, budget, end, rng)
+    if budget < ROUNDS.min_budget:
+        outcome = yield from MonteCarlo(n=budget, batch=budget).steps(inputs, replace(goal, max_sim=end), rng)
+        about = f"{budget} simulations are too few for a search ({ROUNDS.min_budget}): base draws only."
+        return outcome.remark_first(about)
+    state = yield from _draw_base(run)
+    try:
+        base_rate = state.base_failures / state.n_base
+        if base_rate >= 0.1:  # plain Monte Carlo is as good as anything
+            return (yield from _run_monte_carlo(run, state))
+        state = yield from _walk(run, state)
+        state = yield from _run_rounds(run, state)
+        worthless = state.last_rate < max(ROUNDS.fallback_rate, base_rate)
+        if worthless and run.left >= 300:  # with fewer subset simulation is not worth it
+            return (yield from _fall_back(run, state))
+    except Interrupted:
+        return _estimate_early(run, state)
+    return (yield from _estimate(run, state))
+
+
+def _draw_base(run: SeriesRun) -> SimulationSteps[SeriesState]:
+    """Make the base draws."""
+    n, dim = min(max(int(ROUNDS.size * run.budget), 100), 2000), run.inputs.dim
+    u = run.rng.standard_normal((n, dim))
+    terms = yield from run.simulator.terms(u)
+    history = TermHistory(u, terms, np.full(n, np.log(n)), (IsotropicNormal(dim),), np.array([float(n)]), ((0, n),))
+    failures = int(history.failing(run.goal.gamma).sum())
+    run.simulator.record(failures / n, failures / n, n, binomial_cov(failures / n, n))
+    return SeriesState(history=history, n_base=n, base_failures=failures, base_draws=n)
+
+
+def _walk(run: SeriesRun, state: SeriesState) -> SimulationSteps[SeriesState]:
+    """Walk to the failures of main terms and of others; pursue those that are reached."""
+    terms, simulator = state.history.terms, run.simulator
+    term, rows = plan_walks(terms, run.budget, simulator.offer.count_gradients(1) + 1)
+    limit = simulator.n_sim + int(WALKS.budget_share * run.budget)
+    chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])
+    walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, run.goal.gamma, limit)
+    reached = float((walks.fallen >= 1).mean()) if len(rows) else 0.0
+    simulator.record(reached, simulator.trace[-1].estimate, len(rows), math.inf)
+    return replace(state, pursued=tuple(pursue_walked(walks)))
+
+
+def _run_rounds(run: SeriesRun, state: SeriesState) -> SimulationSteps[SeriesState]:
+    """Draw and refit until the failures of all terms are known, or the rest is for the estimate."""
+    size, kept = int(ROUNDS.size * run.budget), ROUNDS.final_share * run.budget
+    reserve = int((ROUNDS.final_share - ROUNDS.refit_share) * run.budget)
+    while not all(term.ready for term in state.pursued) and run.left - size >= kept:
+        state, _ = yield from _draw_round(run, state, size)
+        state = yield from _refit(run, state, reserve)
+    return state
+
+
+def _draw_round(
+    run: SeriesRun, state: SeriesState, n: int, final: bool = False
+) -> SimulationSteps[tuple[SeriesState, FinalRound]]:
+    """Draw n points from the present proposal; they join the history."""
+    gamma, simulator, first = run.goal.gamma, run.simulator, run.simulator.n_sim
+    components, shares = mix_terms(state.pursued, state.history, gamma, final)
+    counts = draw_counts(shares, n, run.rng)
+    u = draw_components(components, counts, run.rng)
+    terms = yield from simulator.terms(u)
+    log_weights = -mixture_log_ratio(log_ratios(components, u), shares)
+    draws = Draws.from_outcomes(terms.f, log_weights, run.inputs.base.from_standard_normal(u), gamma)
+    lost = ~np.isin(terms.least[draws.fails], [one.number for one in state.pursued]) | np.isneginf(draws.f)
+    other = float(np.exp(draws.log_weights[lost]).sum()) / n
+    y = np.zeros(n)
+    y[draws.fails] = np.exp(draws.log_weights)
+    drawn = FinalRound(draws, stratified_variance(y, counts), other, first)
+    history = state.history.add(u, terms, components, counts.astype(np.float64), first)
+    ess = draws.ess
+    simulator.record(len(draws.f) / n, draws.p, n, 1 / math.sqrt(ess) if ess else math.inf, ess)
+    base_draws = state.base_draws + int(counts[0])
+    return replace(state, history=history, base_draws=base_draws, last_rate=ess / n), drawn
+
+
+def _refit(run: SeriesRun, state: SeriesState, reserve: int) -> SimulationSteps[SeriesState]:
+    """Fit the proposals anew, leaving `reserve` simulations."""
+    limit, gamma = run.budget - reserve, run.goal.gamma
+    steps = refit_terms(run.simulator, state.history, state.pursued, gamma, limit, run.rng)
+    return replace(state, pursued=(yield from steps))
+
+
+def _estimate(run: SeriesRun, state: SeriesState) -> Steps:
+    """Make the final rounds; with a target c.o.v. end when it is met, or draw further batches until then."""
+    goal, stopped, number, planned = run.goal, False, 0, len(ROUNDS.final_sizes)
+    room = run.left - int((planned - 1) * ROUNDS.refit_share * run.budget)
+    sizes = [int(share * room) for share in ROUNDS.final_sizes]
+    while number < planned or (goal.target_cov is not None and run.left_at_all > 0):
+        if number and run.meets_target(combine_rounds(state.finals).cov):
+            break
+        try:
+            if 0 < number < planned:
+                state = yield from _refit(run, state, sum(sizes[number:]))
+            size = run.left if number == planned - 1 else sizes[number] if number < planned else ROUNDS.target_batch
+            state, drawn = yield from _draw_round(run, state, min(size, run.left_at_all), final=True)
+        except Interrupted:
+            stopped = True
+            break
+        drawn = replace(drawn, factor=ROUNDS.final_weights[min(number, planned - 1)])
+        state, number = replace(state, finals=(*state.finals, drawn)), number + 1
+    return _conclude(run, state, stopped) if state.finals else _estimate_early(run, state)
+
+
+def _conclude(run: SeriesRun, state: SeriesState, stopped: bool) -> Outcome:
+    """Return the outcome of the final rounds."""
+    rounds, confidence = state.finals, run.goal.confidence
+    c, parts, draws, cov = combine_rounds(rounds)
+    status = Status.STOPPED if stopped else Status.CONVERGED
+    largest = float((c * draws.n / [part.n for part in parts]).max()) / ROUNDS.base_share
+    outcome = draws.outcome(run.goal, status, run.simulator.close_trace(), largest, state.base_draws)
+    ceiling = clopper_pearson(state.base_failures, state.n_base, confidence)[1]  # no proposal has chosen these draws
+    warnings = [*outcome.warnings]
+    other = float(c @ [one.other for one in rounds]) / max(draws.p, np.finfo(np.float64).tiny)
+    if other > 0.05:
+        warnings.append(f"{100 * other:.0f} % of p comes from terms without a proposal of their own.")
+    return replace(
+        outcome,
+        cov=cov,
+        interval=weighted_interval(draws, confidence, largest, cov, ceiling),
+        warnings=tuple(warnings),
+        draw_weights=sum((part.weights_after(one.first, draws.n) for part, one in zip(parts, rounds, strict=True)), ()),
+    )
+
+
+def _estimate_early(run: SeriesRun, state: SeriesState) -> Outcome:
+    """Return what all draws from known proposals say, for a run that ends before its estimate."""
+    history, largest = state.history, len(state.history.u) / state.n_base
+    x = run.inputs.base.from_standard_normal(history.u)
+    draws = Draws.from_outcomes(history.terms.f, history.log_weights + math.log(len(x)), x, run.goal.gamma)
+    outcome = draws.outcome(run.goal, Status.STOPPED, run.simulator.close_trace(), largest, state.base_draws)
+    weights = DrawWeights(first=0, log_weights=history.log_weights)
+    return replace(outcome, draw_weights=weights.split(*history.batches))
+
+
+def _run_monte_carlo(run: SeriesRun, state: SeriesState) -> Steps:
+    """Spend the rest on base draws; those made so far decided on this and do not count."""
+    left = run.left_at_all
+    method = MonteCarlo(n=left, batch=10_000 if run.goal.target_cov is None else ROUNDS.target_batch)
+    return _after(run, state, (yield from method.steps(run.inputs, replace(run.goal, max_sim=left), run.rng)))
+
+
+def _fall_back(run: SeriesRun, state: SeriesState) -> Steps:
+    """Spend the rest on subset simulation in the order of the terms, with six levels where nothing is known."""
+    left, gamma = run.left_at_all, run.goal.gamma
+    p = min(float(np.exp(state.history.log_weights[state.history.failing(gamma)]).sum()), 1.0)
+    levels = min(math.ceil(-math.log10(p)), 6) if p > 0 else 6
+    steps = spend_on_subset_simulation(run.inputs, replace(run.goal, max_sim=left), levels, left, None, run.rng)
+    return _after(run, state, (yield from order_by_terms(steps, gamma)))
+
+
+def _after(run: SeriesRun, state: SeriesState, outcome: Outcome) -> Outcome:
+    """Return the outcome of another method that used the rest."""
+    earlier = run.simulator.close_trace()
+    spent = sum(level.n_sim for level in earlier)
+    return replace(
+        outcome,
+        trace=(*earlier, *outcome.trace),
+        base_draws=state.base_draws + outcome.base_draws,
+        counts=None,
+        draw_weights=tuple(replace(weights, first=weights.first + spent) for weights in outcome.draw_weights),
+    )

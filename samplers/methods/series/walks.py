@@ -1,8 +1,7 @@
 """Gradient walks, and terms with their gradients in standard normal space, where what they cost is counted."""
 
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar, cast
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,44 +11,11 @@ from samplers.methods.base import SimulationSteps, Simulator, noise_mask
 from samplers.methods.series.settings import WALKS
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
 
-_T = TypeVar("_T")
-
-DIFFERENCE = 1e-4
-"""Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
-POINTS_AT_ONCE = 4
-"""Points at which T is differentiated at once: 4 with 386 groups of 1,448 coordinates take 70 MB."""
-PATTERN_POINTS = 3
-"""Points at which it is seen which coordinates of u a coordinate of x depends on."""
-
 
 def join_terms(parts: Sequence[Terms]) -> Terms:
     """Return the terms of some batches, at least one, as those of one."""
     f, values, ticks = (np.concatenate([getattr(one, name) for one in parts]) for name in ("f", "values", "ticks"))
     return Terms(f, values, ticks, parts[0].threshold, next((one.names for one in parts if one.names), ()))
-
-
-def answer_by_terms(
-    steps: Generator[FloatArray, FloatArray, _T], read: Callable[[FloatArray, Terms], FloatArray]
-) -> Generator[FloatArray, FloatArray, _T]:
-    """Run steps that ask for f (n,) at points (n, d), with terms requested in its place, from which `read` gives f."""
-    answer: FloatArray | None = None
-    while True:
-        try:
-            x = next(steps) if answer is None else steps.send(answer)
-        except StopIteration as end:
-            return cast(_T, end.value)
-        if len(x) == 0:
-            answer = np.empty(0)
-            continue
-        try:
-            terms = yield from request_terms(x)
-        except BaseException as error:
-            try:
-                steps.throw(error)
-            except StopIteration as end:
-                return cast(_T, end.value)
-            raise
-        answer = read(x, terms)
 
 
 class TermSimulator(Simulator):
@@ -58,7 +24,6 @@ class TermSimulator(Simulator):
     def __init__(self, inputs: Inputs, offer: TermsOffer, goal: Goal) -> None:
         super().__init__(inputs, goal)
         self.offer = offer
-        self._slopes: TransformSlopes | None = None
 
     def terms(self, u: FloatArray) -> SimulationSteps[Terms]:
         """Return the terms at u (n, d), n > 0."""
@@ -74,185 +39,90 @@ class TermSimulator(Simulator):
             return np.empty_like(u)
         answer = yield from request_gradients(self.inputs.base.from_standard_normal(u), term, ticks)
         self.n_sim += whole_simulations(answer.cost)
-        if self._slopes is None:
-            self._slopes = TransformSlopes(self.inputs)
-        return self._slopes.pull_back(u, answer.values)
+        return pull_back(self.inputs.base, u, answer.values, noise_mask(self.inputs))
 
 
-class TransformSlopes:
-    """Derivatives of x = T(u), the map from standard normal space, block by block: no simulation.
+def pull_back(base: Any, u: FloatArray, gradients: FloatArray, noise: NDArray[np.bool_]) -> FloatArray:
+    """Return the gradients (n, d) by x = T(u), at u (n, d), as gradients by u, block by block: no simulation.
 
-    A block with `pull_back`, as here, has its own; others are differentiated by `DifferencedMap`.
+    A block with `pull_back` has its own; others are differentiated by central differences, but for noise (d,), which is
+    its own u. Where each x_i depends on its own u_i alone, as the first point shows, one difference gives all of them.
     """
+    if isinstance(base, StandardNormal) or noise.all():
+        return gradients
+    if hasattr(base, "pull_back"):
+        return np.asarray(base.pull_back(u, gradients))
+    blocks = tuple(getattr(base, "blocks", ()))  # independent, side by side
+    dims = [block.dim for block in blocks]
+    if sum(dims) == len(noise) and all(isinstance(block, Distribution) for block in blocks):
+        ends = np.cumsum(dims)[:-1]
+        parts = zip(blocks, *(np.split(each, ends, axis=-1) for each in (u, gradients, noise)), strict=True)
+        return np.hstack([pull_back(*part) for part in parts])
 
-    def __init__(self, inputs: Inputs) -> None:
-        base, noise = inputs.base, noise_mask(inputs)
-        self._identity = isinstance(base, StandardNormal)
-        blocks: tuple[Any, ...] = tuple(getattr(base, "blocks", ()))  # independent, side by side
-        dims = [block.dim for block in blocks]
-        if sum(dims) != inputs.dim or not all(isinstance(block, Distribution) for block in blocks):
-            blocks, dims = (base,), [inputs.dim]
-        self._ends = np.cumsum(dims)[:-1]
-        self._maps = [
-            block if hasattr(block, "pull_back") else DifferencedMap(block, own)
-            for block, own in zip(blocks, np.split(noise, self._ends), strict=True)
-        ]
+    step = 1e-4  # standard deviations: the error is 1e-8, that of rounding 1e-12
 
-    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
-        """Return the gradients (n, d) with respect to x at T(u), u (n, d), as gradients with respect to u."""
-        if self._identity:
-            return gradients
-        parts = (np.split(points, self._ends, axis=1) for points in (u, gradients))
-        return np.hstack([each.pull_back(*part) for each, *part in zip(self._maps, *parts, strict=True)])
+    def differences(at: FloatArray, steps: FloatArray) -> FloatArray:
+        ahead, behind = np.split(base.from_standard_normal(np.concatenate([at + steps, at - steps])), 2)
+        return np.asarray((ahead - behind) / (2 * step))
+
+    result, moved = gradients.copy(), np.flatnonzero(~noise)
+    each = step * np.eye(len(noise))[moved]
+    rows, columns = np.nonzero(differences(u[0], each))
+    if (moved[rows] == columns).all():
+        result[:, moved] *= differences(u, each.sum(axis=0))[:, moved]
+    else:
+        result[:, moved] = [differences(point, each) @ own for point, own in zip(u, gradients, strict=True)]
+    return result
 
 
-class DifferencedMap:
-    """Derivatives of x = T(u) by finite differences of it.
+class Walks(NamedTuple):
+    """Walks of several terms where they have come, and what they have met."""
 
-    Coordinates of noise are themselves. Others that no coordinate of x depends on together are moved at the same time,
-    as Curtis, Powell and Reid ("On the estimation of sparse Jacobian matrices", 1974) do: where each x depends on its
-    own u alone, one difference gives all of them.
+    term: NDArray[np.int64]  # that each walk follows, (m,)
+    u: FloatArray  # points reached, (m, d)
+    fallen: FloatArray  # share of the way from the first value to the threshold, (m,)
+    distance: FloatArray  # beta of the half-space that the last gradient describes; NaN for none; (m,)
+    gradient_terms: NDArray[np.int64]  # (k,)
+    gradients: FloatArray  # of unit length, at all points that the walks have passed, (k, d)
+    failing_terms: NDArray[np.int64]  # the least ones, (l,)
+    failures: FloatArray  # points at which f fails, of whatever term, (l, d)
+
+
+def plan_walks(terms: Terms, budget: int, step: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the term of each walk and the base draw (a row of `terms`) that it starts from, shapes (m,).
+
+    Main terms, which are often the least among low draws, have many walks, others two, most promising first, as many as
+    can make two steps of a cost of `step` simulations. Of a term's starts half are low values attained late.
     """
-
-    def __init__(self, base: Distribution, noise: NDArray[np.bool_]) -> None:
-        self._base = base
-        self._moved = np.flatnonzero(~noise)
-        self._groups: list[NDArray[np.int64]] | None = None
-        self._pattern = np.zeros((0, len(noise)), dtype=bool)
-
-    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
-        """Return the gradients (n, d) with respect to x at T(u), u (n, d), as gradients with respect to u."""
-        if self._groups is None:
-            self._groups = self._find_pattern(u[:PATTERN_POINTS])
-        result = gradients.copy()  # noise, where dx / du = I
-        for first in range(0, len(u), POINTS_AT_ONCE):
-            part = slice(first, first + POINTS_AT_ONCE)
-            slopes = self._differences(u[part], [self._moved[group] for group in self._groups])
-            for group, slope in zip(self._groups, slopes, strict=True):
-                result[part, self._moved[group]] = (slope * gradients[part]) @ self._pattern[group].T
-        return result
-
-    def _find_pattern(self, u: FloatArray) -> list[NDArray[np.int64]]:
-        """Find which coordinates of x each moved coordinate of u changes; return groups of them that do not meet."""
-        self._pattern = (self._differences(u, list(self._moved[:, None])) != 0).any(axis=1)
-        groups, taken = list[list[int]](), list[NDArray[np.bool_]]()
-        for number, row in enumerate(self._pattern):
-            k = next((k for k, seen in enumerate(taken) if not (seen & row).any()), len(groups))
-            if k == len(groups):
-                groups.append([])
-                taken.append(np.zeros_like(row))
-            groups[k].append(number)
-            taken[k] = taken[k] | row
-        return [np.array(group) for group in groups]
-
-    def _differences(self, u: FloatArray, groups: list[NDArray[np.int64]]) -> FloatArray:
-        """Return central differences of T at u (n, d), with the coordinates of each group moved together, (k, n, d)."""
-        steps = np.zeros((len(groups), 1, u.shape[1]))
-        for row, group in zip(steps, groups, strict=True):
-            row[0, group] = DIFFERENCE
-        x = self._base.from_standard_normal(np.concatenate([u + steps, u - steps]).reshape(-1, u.shape[1]))
-        ahead, behind = x.reshape(2, len(groups), *u.shape)
-        return np.asarray((ahead - behind) / (2 * DIFFERENCE))
-
-
-class Directions(NamedTuple):
-    """Unit gradients of terms, where they exist."""
-
-    term: NDArray[np.int64]
-    """Shape (k,)."""
-    values: FloatArray
-    """Shape (k, d)."""
-    design_points: FloatArray
-    """Points nearest to the origin of the half-spaces that the gradients describe, shape (k, d); NaN where the term is
-    not near its threshold."""
-
-    def of(self, term: int) -> "Directions":
-        """Return those of one term."""
-        mine = self.term == term
-        return Directions(self.term[mine], self.values[mine], self.design_points[mine])
-
-    def join(self, later: "Directions") -> "Directions":
-        """Return these and later ones."""
-        return Directions(*(np.concatenate(pair) for pair in zip(self, later, strict=True)))
-
-
-MIN_WALK_STEPS = 2
-"""Steps that there must be room for before another walk is begun."""
-NEAR_FAILURES = 1.5
-"""Standard deviations along the gradient to the threshold within which a gradient is taken for that of the failures."""
-
-
-def describe_half_spaces(term: NDArray[np.int64], u: FloatArray, slopes: FloatArray, excess: FloatArray) -> Directions:
-    """Return unit gradients where they exist, and the half-spaces {excess + slope (v - u) <= 0} of those near them.
-
-    The terms (k,) have these slopes (k, d) at points u (k, d), where they exceed their threshold by `excess` (k,).
-    """
-    norm = np.linalg.norm(slopes, axis=1)
-    good = np.isfinite(norm) & (norm > 0)
-    unit, ahead = slopes[good] / norm[good, None], excess[good] / norm[good]
-    distance = ahead - np.einsum("ij,ij->i", unit, u[good])
-    near = (np.abs(ahead) <= NEAR_FAILURES) & (distance > 0)
-    return Directions(term[good], unit, np.where(near, -distance, np.nan)[:, None] * unit)
-
-
-@dataclass(frozen=True, eq=False)
-class Walks:
-    """Walks of several terms where they have come."""
-
-    term: NDArray[np.int64]
-    """Term that each walk follows, shape (m,)."""
-    u: FloatArray
-    """Points reached, shape (m, d)."""
-    values: FloatArray
-    """The term there, shape (m,)."""
-    start_values: FloatArray
-    """The term where they began, shape (m,)."""
-    ticks: NDArray[np.int64]
-    """When it is attained, shape (m,)."""
-    distance: FloatArray
-    """Of the origin from the half-space that the last gradient of each walk describes, beta; NaN for none; (m,)."""
-    directions: Directions
-    """At all points that the walks have passed."""
-    failures: FloatArray
-    """Points on the way at which f fails, of whatever term, shape (k, d)."""
-    failing_terms: NDArray[np.int64]
-    """Their least terms, shape (k,)."""
-
-
-def choose_terms(terms: Terms) -> tuple[list[int], list[int]]:
-    """Return main terms, which are often the least among low draws, and other terms to scout, most promising first."""
-    lowest, known = terms.lowest, np.isfinite(terms.values).all(axis=1)
+    known = np.isfinite(terms.values).all(axis=1)
+    lowest, numbers = terms.lowest, np.arange(terms.values.shape[1])
+    none = np.empty(0, dtype=np.int64)
     if not known.any():
-        return [], []
-    low = known & (lowest <= np.quantile(lowest[known], WALKS.candidate_quantile))
-    n_terms = terms.values.shape[1]
-    counts = np.bincount(terms.least[low], minlength=n_terms)
-    ever = np.bincount(terms.least[known], minlength=n_terms) > 0
-    main = [j for j in range(n_terms) if counts[j] >= max(WALKS.candidate_share * len(lowest), 1)]
+        return none, none
+    low = known & (lowest <= np.quantile(lowest[known], 0.2))
+    counts = np.bincount(terms.least[low], minlength=len(numbers))
+    ever = np.isin(numbers, terms.least[known])
+    main = counts >= max(WALKS.candidate_share * len(lowest), 1)
+    affordable = int(WALKS.budget_share * budget / (2 * step))
+    each = int(np.clip(min(WALKS.walkers, affordable) // max(main.sum(), 1), 2, WALKS.most))
     order = np.lexsort((terms.values[known].min(axis=0), ~ever))  # those that ever are the least come first
-    others = [int(j) for j in order if j not in main]
-    return main, others[: max(WALKS.max_scouted, int(ever.sum()) - len(main))]
+    others = [j for j in order if not main[j]][: max(WALKS.most_scouted, int((ever & ~main).sum()))]
+    others = others[: max(affordable - each * int(main.sum()), 0) // WALKS.scouts]
+    walked = [(j, each) for j in numbers[main]] + [(j, WALKS.scouts) for j in others]
+    starts = [_choose_starts(terms.values[:, j], terms.ticks[:, j], n) for j, n in walked]
+    return np.repeat([j for j, _ in walked], [len(one) for one in starts]).astype(np.int64), np.concatenate(
+        [none, *starts]
+    )
 
 
-def count_walks(n_main: int, n_others: int, budget: int, step: float) -> tuple[int, int]:
-    """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps."""
-    affordable = int(WALKS.budget_share * budget / (MIN_WALK_STEPS * step))
-    walkers = WALKS.walkers * min(1.0, budget / WALKS.usual_budget)
-    wanted = int(np.clip(walkers / max(n_main, 1), WALKS.min_walkers, WALKS.max_walkers))
-    each = min(wanted, max(affordable // max(n_main, 1), 2))
-    return each, min(n_others, max(affordable - each * n_main, 0) // WALKS.scouts)
-
-
-def choose_starts(terms: Terms, term: int, n: int) -> NDArray[np.int64]:
-    """Return the rows from which n walks of a term start: low values, half of them attained late."""
-    values, ticks = terms.values[:, term], terms.ticks[:, term]
+def _choose_starts(values: FloatArray, ticks: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Return at most n rows of the lower half of a term's values (k,), early and late ones by turns, lowest first."""
     order = np.argsort(values, kind="stable")
     order = order[np.isfinite(values[order])]
-    lower = order[: max(int(WALKS.start_quantile * len(order)), n)]
+    lower = order[: max(len(order) // 2, n)]
     late = ticks[lower] > np.median(ticks[lower])
-    chosen = [*lower[late][: n // 2], *lower[~late][: n - n // 2]]
-    chosen += [row for row in lower if row not in chosen][: n - len(chosen)]
-    return np.array(chosen[:n], dtype=np.int64)
+    turn = np.where(late, np.cumsum(late), np.cumsum(~late))
+    return np.asarray(lower[np.argsort(turn, kind="stable")][:n])
 
 
 def walk_downhill(
@@ -264,52 +134,42 @@ def walk_downhill(
     linear, but no further than its length. A step that does not fall is taken back, and its gradient kept. `limit` is
     a value of `simulator.n_sim` that is not exceeded.
     """
-    rows = np.arange(len(u))
-    distance = np.full(len(u), np.nan)
-    start_values = terms.values[rows, term]
-    u, values, ticks = u.copy(), terms.values[rows, term].copy(), terms.ticks[rows, term].copy()
-    slope, length, moved = np.full_like(u, np.nan), np.full(len(u), WALKS.first_step), np.ones(len(u), dtype=bool)
-    passed = describe_half_spaces(term[:0], u[:0], u[:0], values[:0])
-    failing = list[tuple[FloatArray, NDArray[np.int64]]]()
-    for step in range(WALKS.steps):
-        open_ = (values > terms.threshold) & ~(distance > WALKS.max_distance)
-        fresh = np.flatnonzero(moved & (open_ | (step == 0)))
-        cost = simulator.offer.count_gradients(len(fresh)) + int(open_.sum())
-        if not (len(fresh) or open_.any()) or simulator.n_sim + cost > limit:
+    rows, threshold = np.arange(len(u)), terms.threshold
+    u, excess, ticks = u.copy(), terms.values[rows, term] - threshold, terms.ticks[rows, term].copy()
+    first, distance, length = excess.copy(), np.full(len(u), np.nan), np.full(len(u), WALKS.first_step)
+    unit, ahead, fresh = np.full_like(u, np.nan), np.full(len(u), np.nan), rows
+    passed, failing = [(term[:0], u[:0])], [(term[:0], u[:0])]
+    for _ in range(WALKS.steps):
+        walking = (excess > 0) & ~(distance > WALKS.max_distance)
+        cost = simulator.offer.count_gradients(len(fresh)) + int(walking.sum())
+        if simulator.n_sim + cost > limit:
             break
-        slope[fresh] = yield from simulator.gradients(u[fresh], term[fresh], ticks[fresh])
+        slope = yield from simulator.gradients(u[fresh], term[fresh], ticks[fresh])
         norm = np.linalg.norm(slope, axis=1)
-        sloping = np.isfinite(norm) & (norm > 0)
-        good = fresh[sloping[fresh]]
-        excess = values - terms.threshold
-        passed = passed.join(describe_half_spaces(term[fresh], u[fresh], slope[fresh], excess[fresh]))
-        ahead_of = excess / np.where(sloping, norm, np.nan)
-        distance[good] = ahead_of[good] - np.einsum("ij,ij->i", slope[good], u[good]) / norm[good]
-        walkers = np.flatnonzero(open_ & sloping & (distance <= WALKS.max_distance))
+        norm[~np.isfinite(norm) | (norm == 0)] = np.nan
+        unit[fresh], ahead[fresh] = slope / norm[:, None], excess[fresh] / norm
+        distance[fresh] = ahead[fresh] - np.einsum("ij,ij->i", unit[fresh], u[fresh])
+        sloping = fresh[~np.isnan(norm)]
+        passed.append((term[sloping], unit[sloping]))
+        walkers = np.flatnonzero(walking & (distance <= WALKS.max_distance))
         if len(walkers) == 0:
             break
-        size = np.minimum(ahead_of[walkers] + WALKS.beyond, length[walkers])
-        ahead = u[walkers] - (size / norm[walkers])[:, None] * slope[walkers]
-        seen = yield from simulator.terms(ahead)
+        size = np.minimum(ahead[walkers] + 0.03, length[walkers])  # beyond the threshold: rounding must not stop it
+        reached = u[walkers] - size[:, None] * unit[walkers]
+        seen = yield from simulator.terms(reached)
         known = np.isfinite(seen.f)
         fails = known & (seen.f <= gamma)
-        failing.append((ahead[fails], seen.least[fails]))
-        value = seen.values[np.arange(len(walkers)), term[walkers]]
-        fell = known & (value < values[walkers])
+        failing.append((seen.least[fails], reached[fails]))
+        own = np.arange(len(walkers)), term[walkers]
+        fell = known & (seen.values[own] - threshold < excess[walkers])
         taken = walkers[fell]
-        u[taken], values[taken] = ahead[fell], value[fell]
-        ticks[taken] = seen.ticks[np.flatnonzero(fell), term[taken]]
-        length[walkers] *= np.where(fell, WALKS.growth, WALKS.shrinkage)
-        moved = np.zeros(len(u), dtype=bool)
-        moved[taken] = True
-    return Walks(
-        term,
-        u,
-        values,
-        start_values,
-        ticks,
-        distance,
-        passed,
-        np.concatenate([u[:0], *(points for points, _ in failing)]),
-        np.concatenate([np.empty(0, np.int64), *(least for _, least in failing)]),
-    )
+        u[taken], excess[taken], ticks[taken] = (
+            reached[fell],
+            (seen.values[own] - threshold)[fell],
+            seen.ticks[own][fell],
+        )
+        length[walkers] *= np.where(fell, WALKS.first_step, WALKS.shrinkage)
+        fresh = taken[excess[taken] > 0]
+    fallen = np.where(first > 0, 1 - excess / np.where(first > 0, first, 1.0), 1.0)
+    met = [np.concatenate(parts) for found in (passed, failing) for parts in zip(*found, strict=True)]
+    return Walks(term, u, fallen, distance, *met)
