@@ -32,7 +32,7 @@ from samplers.problem import FloatArray, Problem, check_whole, names_of_columns
 from samplers.replicate import UNRESOLVED_SHARE
 from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
-from samplers.sample import Interval, degrees_of_freedom, effective_number, zero_hit_bound
+from samplers.sample import Interval, bound_missed, degrees_of_freedom, effective_number
 
 if TYPE_CHECKING:
     import pyarrow
@@ -368,7 +368,7 @@ def _ratio_interval(totals: FloatArray, factor: float, single: bool, either: Est
     apart = totals[0] != totals[1]  # units that tell the two from one another
     if p_a == 0 or p_b == 0 or not apart.any():
         # none of `ess` effective draws was of the kind that is missing: its share is at most
-        share = zero_hit_bound(max(round(effective_number(totals.max(axis=0))), 1), either.confidence)
+        share = bound_missed([(1.0, max(round(effective_number(totals.max(axis=0))), 1))], either.confidence)
         if either.parts:
             share = _find_missed(np.zeros_like(totals[0]), totals, either)[0] / max(p_a, p_b)
             share = share if min(p_a, p_b) == 0 else min(share, 1 - 1e-9)

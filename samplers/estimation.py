@@ -285,36 +285,28 @@ def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
 
 
 def _follow_chunks(listener: Listener, evaluator: Evaluator, max_sim: int | None) -> Listener:
-    """Return a listener of a run that is told of every chunk of the workers too, and how long the rest takes."""
-    started, shown, latest = time.monotonic(), 0, Progress(n_sim=0, max_sim=max_sim)
+    """Return a listener of a run that is told of every chunk of the workers too."""
+    shown, latest = 0, Progress(n_sim=0, max_sim=max_sim)
 
     def show(progress: Progress, n_more: int = 0) -> None:
         nonlocal latest, shown
         latest, n_sim, pool = progress, progress.n_sim + n_more, evaluator.pool
         if n_more and n_sim <= shown:
             return
-        shown, n_made = n_sim, n_sim - evaluator.n_restored
-        left = None
-        if progress.max_sim is not None and n_made > 0:
-            left = (progress.max_sim - n_sim) * (time.monotonic() - started) / n_made
-        about = {"workers": pool.workers, "n_retries": pool.n_retries}
-        listener(replace(progress, n_sim=n_sim, seconds_left=left, **about))
+        shown = n_sim
+        listener(replace(progress, n_sim=n_sim, workers=pool.workers, n_retries=pool.n_retries))
 
     evaluator.on_chunk = lambda n_done: show(latest, n_done)
     return show
 
 
 def describe_progress(progress: Progress) -> str:
-    """Return the level and p so far, and with workers their number, what they lost, and the time left."""
+    """Return the level and p so far, and with workers their number and what they lost."""
     words = f"run {progress.run + 1} " if progress.run else ""
     if not math.isnan(progress.p):
         words += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
     if progress.workers:
         words += f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
-    if progress.seconds_left is not None:
-        units = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
-        unit, seconds = next((each for each in units if progress.seconds_left >= 2 * each[1]), units[-1])
-        words += f", {progress.seconds_left / seconds:.0f} {unit} left"
     return words
 
 
@@ -322,13 +314,13 @@ def describe_progress(progress: Progress) -> str:
 def show_bar(max_sim: int | None) -> Iterator[Listener]:
     """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
     from rich.console import Console  # optional, and slow to import
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    console, time_column = Console(stderr=True), TimeElapsedColumn()
+    console, times = Console(stderr=True), (TimeRemainingColumn(), TextColumn("left after"), TimeElapsedColumn())
     columns = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} {task.fields[unit]}"))
     state_column = (TextColumn("{task.fields[state]}", markup=False),) if console.width >= NARROW_TERMINAL else ()
-    bar = Bar(*columns, *state_column, time_column, console=console)
+    bar = Bar(*columns, *state_column, *(times if max_sim else times[-1:]), console=console)
     task = bar.add_task("", total=max_sim, state="", unit="simulations")
 
     def show(progress: Progress) -> None:

@@ -433,56 +433,33 @@ MOST_FAILING_BYTES = 2**26
 LEAST_FAILING = 10_000
 
 
-class EvenlySpaced:
-    """Rows 0, s, 2 s, ... of a stream, chosen by number alone; s is 1 and doubles beyond `most` rows."""
-
-    def __init__(self, most: int, shape: tuple[int, ...] = ()) -> None:
-        self.stride, self.n = 1, 0
-        self._most, self._kept = most, 0
-        self._parts: list[NDArray[Any]] = [np.empty((0, *shape))]
-
-    @property
-    def values(self) -> NDArray[Any]:
-        """Rows kept, shape (k, ...)."""
-        self._parts = [np.concatenate(self._parts)]
-        return self._parts[0]
-
-    def add(self, rows: NDArray[Any]) -> None:
-        """See more rows (n, ...)."""
-        new = rows[-self.n % self.stride :: self.stride]
-        self._parts.append(new if self.stride == 1 else new.copy())  # a view would keep the whole batch
-        self._kept += len(new)
-        self.n += len(rows)
-        while self._kept > self._most:
-            self._parts = [self.values[::2].copy()]
-            self._kept, self.stride = len(self._parts[0]), 2 * self.stride
-
-
 class KeptDraws:
-    """Independent draws of equal weight: all of them while they are few, evenly spaced ones when they are many."""
+    """Independent draws of equal weight: p is that of all, and the first ones are kept."""
 
     def __init__(self, gamma: float, dim: int, most: int = MOST_DRAWS, most_failing: int | None = None) -> None:
-        self._gamma, self._n_missing = gamma, 0
-        room = most_failing or max(MOST_FAILING_BYTES // (8 * max(dim, 1)), LEAST_FAILING)
-        self._f, self._x, self._f_failing = EvenlySpaced(most), EvenlySpaced(room, (dim,)), EvenlySpaced(room)
+        self._gamma, self._most = gamma, most
+        self._room = most_failing or max(MOST_FAILING_BYTES // (8 * max(dim, 1)), LEAST_FAILING)
+        self._hits = self._n = self._n_missing = 0
+        self._f, self._x, self._f_failing = [np.empty(0)], [np.empty((0, dim))], [np.empty(0)]
 
     def add(self, x: FloatArray, f: FloatArray) -> None:
         """Add draws x (n, d) with outcomes f (n,)."""
-        fails = f <= self._gamma
-        self._f.add(f)
-        self._x.add(x[fails])
-        self._f_failing.add(f[fails])
+        fails, room = f <= self._gamma, max(self._room - self._hits, 0)
+        self._f.append(f[: max(self._most - self._n, 0)])
+        self._x.append(x[fails][:room])
+        self._f_failing.append(f[fails][:room])
+        self._n, self._hits = self._n + len(f), self._hits + int(fails.sum())
         self._n_missing += int(np.isneginf(f[fails]).sum())
 
     @property
     def counts(self) -> tuple[int, int]:
         """Failing draws and all draws."""
-        return self._x.n, self._f.n
+        return self._hits, self._n
 
     def outcome(self, goal: Goal, trace: list[Level]) -> Outcome:
         """Return the outcome of a run that ends with them; kept draws stand for all, and their weights make p exact."""
-        (hits, n), f, x, failing = self.counts, self._f.values, self._x.values, self._f_failing.values
-        if self._f.stride == 1 and self._x.stride == 1:
+        (hits, n), f, x, failing = self.counts, *map(np.concatenate, (self._f, self._x, self._f_failing))
+        if len(f) == n and len(x) == hits:
             sample = Sample.of_equal_draws(f, x)
         else:
             safe = f[f > self._gamma]

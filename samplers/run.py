@@ -138,8 +138,6 @@ class Progress:
     """Workers of the executor; 0 without one."""
     n_retries: int = 0
     """Chunks that were computed again because a worker was lost."""
-    seconds_left: float | None = None
-    """Time that the rest of max_sim takes at the pace so far [s]; None where that is not known."""
 
 
 Listener = Callable[[Progress], None]

@@ -323,11 +323,6 @@ def effective_sample_size(log_weights: FloatArray) -> float:
     return float(np.exp(2 * logsumexp(log_weights) - logsumexp(2 * log_weights)))
 
 
-def largest_weight_share(log_weights: FloatArray) -> float:
-    """Return the largest weight as a share of their sum; 0 for none."""
-    return float(normalise_weights(log_weights).max()) if log_weights.size else 0.0
-
-
 def effective_number(terms: FloatArray) -> float:
     """Return the effective number of terms (n,), (sum t)^2 / sum t^2; 0 where all are 0."""
     total, squares = float(terms.sum()), float((terms**2).sum())
@@ -351,20 +346,14 @@ def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
     return low, high
 
 
-def zero_hit_bound(n: int, confidence: float) -> float:
-    """Return the one-sided Clopper-Pearson bound of a probability of which n draws showed nothing; 1 for n = 0."""
-    return -math.expm1(math.log1p(-confidence) / n) if n else 1.0
-
-
 def bound_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> float:
     """Return the largest probability of a region that all draws miss with probability 1 - confidence.
 
     `drawn` has the share w_k of each stratum and the n_k draws made in it. A region with the part m_k of a stratum is
     missed with probability prod_k (1 - m_k)^n_k; sum_k w_k m_k is largest where w_k (1 - m_k) / n_k is the same for all
-    strata that it reaches into, and those without a draw belong to it whole.
+    strata that it reaches into, and those without a draw belong to it whole. Of one stratum it is the one-sided
+    Clopper-Pearson bound of a probability of which n draws showed nothing, 1 - (1 - confidence)^(1 / n).
     """
-    if len(drawn) == 1:
-        return zero_hit_bound(drawn[0][1], confidence)
     w, n = (np.array(column, dtype=np.float64) for column in zip(*drawn, strict=True))
     whole, order = float(w[n == 0].sum()), np.argsort(-w / np.maximum(n, 1.0))
     w, n = (column[order][n[order] > 0] for column in (w, n))
@@ -525,9 +514,5 @@ def raise_log_end(half: float, lineages: float, confidence: float) -> float:
     sigma = half / ndtri(tail)
     shares = betaincinv(PRIOR_SHARE, lineages, (np.arange(QUANTILES) + 0.5) / QUANTILES)
     shift = np.log1p(-np.minimum(shares, 1 - 1e-12))  # of log p, were it all of it
-    below, above = 0.0, half - shift.min()
-    for _ in range(60):
-        middle = 0.5 * (below + above)
-        short = ndtr((middle + shift) / sigma).mean() < tail
-        below, above = (middle, above) if short else (below, middle)
-    return float(above)
+    most = half - float(shift.min())
+    return float(brentq(lambda end: ndtr((end + shift) / sigma).mean() - tail, 0.0, most + sigma, xtol=1e-12))

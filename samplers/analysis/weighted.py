@@ -27,11 +27,11 @@ from samplers.problem import FloatArray
 from samplers.sample import (
     Interval,
     Sample,
+    bound_missed,
     clopper_pearson,
     degrees_of_freedom,
     effective_number,
     log_normal_interval,
-    zero_hit_bound,
 )
 
 MIN_UNITS = 5.0
@@ -128,7 +128,7 @@ def find_missed(
         first = end
         if not part.resolved or own < MIN_UNITS:
             draws = round(all_of_it) if part.resolved else 0
-            squares += (part.share * part.interval[1] * zero_hit_bound(draws, confidence)) ** 2
+            squares += (part.share * part.interval[1] * bound_missed([(1.0, draws)], confidence)) ** 2
             names.append(part.name)
     return math.sqrt(squares), names
 

@@ -15,7 +15,7 @@ class MonteCarlo(PlainDraws, Method):
     20 % of p to either side: 1.96 c.o.v. = 0.2, that is target_cov = 0.102. Stopping at a c.o.v. t
     makes the interval approximate, and p on average too high by about t^2 of itself: 1 % at t = 0.1.
     Replicates are pooled: their draws are those of one longer run. Memory does not grow with the draws: from a million
-    of them on, `Estimate.curve` and `Estimate.shares` rest on some of them, evenly spaced; p rests on all.
+    of them on, `Estimate.curve` and `Estimate.shares` rest on the first ones; p rests on all.
 
     Args:
         n: Simulations where `max_sim` does not say how many.

@@ -11,7 +11,6 @@ from samplers.sample import (
     confidence_sequence,
     correlation_factor,
     effective_sample_size,
-    largest_weight_share,
     next_level,
     normalise_weights,
 )
@@ -85,5 +84,3 @@ def test_weights_far_outside_the_range_of_floats():
     log_weights = np.array([-5000.0, -5000.0 + np.log(3)])
     np.testing.assert_allclose(normalise_weights(log_weights), [0.25, 0.75])
     assert effective_sample_size(log_weights) == pytest.approx(1.6)
-    assert largest_weight_share(log_weights) == pytest.approx(0.75)
-    assert largest_weight_share(np.empty(0)) == 0
