@@ -369,10 +369,9 @@ class Search:
         """Return base_share of the base, wide_share of the widened proposal and the rest of it; the base for None."""
         if proposal is None:
             return self.base
-        if wide_share == 0:
-            return Mixture(np.array([base_share, 1 - base_share]), [self.base, proposal])
-        shares = np.array([base_share, wide_share, 1 - (base_share + wide_share)])
-        return Mixture(shares, [self.base, proposal.widen(wide_factor), proposal])
+        wide = [proposal.widen(wide_factor)] if wide_share else []
+        shares = [base_share, *([wide_share] if wide_share else []), 1 - (base_share + wide_share)]
+        return Mixture(np.array(shares), [self.base, *wide, proposal])
 
     def draw_final(
         self, sampler: ProposalDistribution, limit: int, batch: int, target_cov: float | None

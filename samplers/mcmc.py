@@ -6,7 +6,7 @@ so that this is also right for an f with noise of its own: on (point, noise) tog
 
 References:
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
-    Probabilistic Engineering Mechanics 16, 2001 (modified Metropolis, section 4).
+    Probabilistic Engineering Mechanics 16, 2001 (modified Metropolis, section 4; correlation, equations 25 to 29).
     Papaioannou, Betz, Zwirglmaier and Straub, "MCMC algorithms for subset simulation",
     Probabilistic Engineering Mechanics 41, 2015 (conditional sampling, section 3.3; its
     adaptation, section 3.4).
@@ -30,7 +30,6 @@ from samplers.sample import (
     Status,
     binomial_cov,
     clopper_pearson,
-    correlation_factor,
     log_normal_interval,
 )
 
@@ -268,3 +267,23 @@ def descent_cov(roots: NDArray[np.int64], n: int) -> float:
     if roots.size == 0:
         return math.inf
     return math.sqrt(max(1 / effective_roots(roots) - 1 / n, 0.0))
+
+
+def correlation_factor(inside: NDArray[np.bool_], lengths: NDArray[np.int64]) -> float:
+    """Return Au and Beck's gamma of an indicator (chains, steps), row i chain i in time order.
+
+    Correlation in chains of these lengths (chains,) raises a variance by 1 + gamma, gamma = 2 sum_k (M_k / N) rho(k),
+    with M_k the pairs at lag k, N the points and rho(k) the correlation at lag k. Negative sums count as 0.
+    """
+    used = np.arange(inside.shape[1]) < lengths[:, None]
+    total = int(used.sum())
+    share = float(inside[used].sum()) / total
+    variance = share * (1 - share)
+    if variance == 0:
+        return 0.0
+    gamma = 0.0
+    for lag in range(1, inside.shape[1]):
+        pairs = used[:, lag:]  # a used point has all its predecessors
+        both = (inside[:, :-lag] & inside[:, lag:])[pairs]
+        gamma += 2 * (float(both.sum()) - both.size * share * share) / (total * variance)
+    return max(gamma, 0.0)

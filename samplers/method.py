@@ -28,6 +28,10 @@ from samplers.sample import (
 )
 
 
+MANY_FAILURES = 5
+"""Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Goal:
     """The probability that a method shall estimate, how well, and with how many simulations.
@@ -116,12 +120,14 @@ class Outcome:
         cls, hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float = 0.0
     ) -> "Outcome":
         """Return the outcome of n independent draws of which `hits` fail, a share of them without an outcome."""
+        none = f"None of {n:,} simulations failed: p = 0 with a one-sided interval."
+        few = f"Only {hits} of {n:,} simulations failed; {COARSE}." if hits else none
         return cls(
             p=hits / n,
             interval=clopper_pearson(hits, n, confidence),
             cov=binomial_cov(hits / n, n),
             status=Status.CONVERGED if hits else Status.NO_HITS,
-            warnings=_hit_warnings(hits, n),
+            warnings=(few,) if hits < MANY_FAILURES else (),
             trace=tuple(trace),
             no_outcome_share=no_outcome_share,
             counts=(hits, n),
@@ -347,19 +353,6 @@ def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> fl
     return min(float(normalise_weights(log_weights)[missing].sum()), 1.0)
 
 
-MANY_FAILURES = 5
-"""Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
-
-
-def _hit_warnings(hits: int, n: int) -> tuple[str, ...]:
-    """Return the warning that few or none of n draws failed, if so."""
-    if hits == 0:
-        return (f"None of {n:,} simulations failed: p = 0 with a one-sided interval.",)
-    if hits < MANY_FAILURES:
-        return (f"Only {hits} of {n:,} simulations failed; {COARSE}.",)
-    return ()
-
-
 @dataclass(frozen=True, kw_only=True)
 class EstimateData(Outcome):
     """What a whole run has found, before any analysis of it: the attributes of `samplers.Estimate`."""
@@ -429,8 +422,7 @@ class EstimateData(Outcome):
 MOST_DRAWS = 2**20
 """Draws whose f is kept at most, 8 MiB."""
 MOST_FAILING_BYTES = 2**26
-"""Bytes of failing points that are kept at most, or `LEAST_FAILING` points if these take more."""
-LEAST_FAILING = 10_000
+"""Bytes of failing points that are kept at most."""
 
 
 class KeptDraws:
@@ -438,7 +430,7 @@ class KeptDraws:
 
     def __init__(self, gamma: float, dim: int, most: int = MOST_DRAWS, most_failing: int | None = None) -> None:
         self._gamma, self._most = gamma, most
-        self._room = most_failing or max(MOST_FAILING_BYTES // (8 * max(dim, 1)), LEAST_FAILING)
+        self._room = most_failing or MOST_FAILING_BYTES // (8 * dim)
         self._hits = self._n = self._n_missing = 0
         self._f, self._x, self._f_failing = [np.empty(0)], [np.empty((0, dim))], [np.empty(0)]
 

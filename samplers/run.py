@@ -439,7 +439,7 @@ class Run:
         return replace(outcome, p=outcome.p * (1 - outcome.no_outcome_share), interval=self._find_ends(outcome))
 
     def _find_sequence(self, whole: Outcome, interval: Interval) -> Interval | None:
-        """Return the ends that hold at every look, around the interval; None where the run stops on nothing it sees."""
+        """Return the ends that hold at every look, around the interval; None where the run stops on nothing seen."""
         target = self._goal.target_cov or getattr(self._named, "own_target", None)
         if target is None or not (0 < whole.p < 1 and 0 < whole.cov < math.inf):
             return None

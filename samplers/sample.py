@@ -2,8 +2,6 @@
 
 References:
     Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
-    Au and Beck, "Estimation of small failure probabilities in high dimensions by subset
-    simulation", Probabilistic Engineering Mechanics 16, 2001 (equations 25 to 29).
     Hall, "On the removal of skewness by transformation", Journal of the Royal Statistical Society B 54, 1992.
     Korn and Graubard, "Confidence intervals for proportions with small expected number of positive
     counts estimated from survey data", Survey Methodology 24, 1998 (degrees of freedom from units).
@@ -395,16 +393,15 @@ def corner_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> floa
 def confidence_sequence(p: float, cov: float, target_cov: float, confidence: float) -> Interval:
     """Return ends of p, 0 < p < 1, that hold it at all looks together, whatever stops the run; asymptotic.
 
-    A mean of n draws stays, at all n with probability 1 - alpha, within
+    The mean of n draws is at all n, with probability 1 - alpha, within
 
         sigma sqrt(2 (n rho^2 + 1) / (n^2 rho^2) log(sqrt(n rho^2 + 1) / alpha)),    rho fixed beforehand,
 
-    which is sigma / sqrt(n) times a factor of v = n rho^2. Here it is the distance from log p, sigma / sqrt(n) is the
-    c.o.v., and n is counted in effective failures, 1 / cov^2: v = v0 (target_cov / cov)^2. The factor is least (1.55
-    times the normal quantile, at 95 %) for v0 = a + log(a) + 1, a = -2 log(alpha): at the target. On the scale of p
-    itself too many upper ends are too low where weights are skew. Few failures need no rule of their own: with one the
-    factor is above 10 at a target of 0.1, and t quantiles are used as in the interval. Each end alone holds with
-    probability 1 - alpha / 2.
+    which is sigma / sqrt(n) times a factor of v = n rho^2. Here sigma / sqrt(n) is the c.o.v., the distance one from
+    log p (from p itself, upper ends of skew weights are too low), and n counts effective failures, 1 / cov^2: at
+    v = v0 (target_cov / cov)^2 the factor is least at the target, 1.55 times the normal quantile at 95 %, with
+    v0 = a + log(a) + 1, a = -2 log(alpha). The first failures need no other rule: at one the factor is above 10, for a
+    target of 0.1, and quantiles are Student's. Each end alone holds with probability 1 - alpha / 2.
     """
     alpha = 1 - confidence
     a = -2 * math.log(alpha)
@@ -442,26 +439,6 @@ def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
     if not 0 < p < 1 or not 0 < cov < 1 or n_sim == 0:
         return math.nan
     return (1 - p) / (p * cov * cov * n_sim)
-
-
-def correlation_factor(inside: NDArray[np.bool_], lengths: NDArray[np.int64]) -> float:
-    """Return Au and Beck's gamma of an indicator (chains, steps), row i chain i in time order.
-
-    Correlation in chains of these lengths (chains,) raises a variance by 1 + gamma, gamma = 2 sum_k (M_k / N) rho(k),
-    with M_k the pairs at lag k, N the points and rho(k) the correlation at lag k. Negative sums count as 0.
-    """
-    used = np.arange(inside.shape[1]) < lengths[:, None]
-    total = int(used.sum())
-    share = float(inside[used].sum()) / total
-    variance = share * (1 - share)
-    if variance == 0:
-        return 0.0
-    gamma = 0.0
-    for lag in range(1, inside.shape[1]):
-        pairs = used[:, lag:]  # a used point has all its predecessors
-        both = (inside[:, :-lag] & inside[:, lag:])[pairs]
-        gamma += 2 * (float(both.sum()) - both.size * share * share) / (total * variance)
-    return max(gamma, 0.0)
 
 
 MAX_TIED_SHARE = 0.5

@@ -5,13 +5,12 @@ the upper end with probability (1 - c) / 2 at most, and below the lower end like
 the ends of a 90 % interval. Where nothing failed, the upper end is the bound that the draws from the base give by
 themselves, whatever the method.
 
-One rule for the ends: those of the interval where the number of simulations was fixed, which is one look; where the
-run stopped on what it saw, those of its confidence sequence, which hold at all looks. Where the base distribution was
-fitted, p is that of the true distribution, and the ends are those that the events behind the base leave
-(`samplers.analysis.base_error`), moved out by as much, unless the base is taken as given.
+A fixed number of simulations is one look, with the ends of the interval; a run that stopped on what it saw has those
+of its confidence sequence, which hold at all looks. Where the base distribution was fitted, they are the ends that the
+events behind the base leave (`samplers.analysis.base_error`), moved out by as much, unless it is taken as given.
 
-Warnings that p may be wrong leave the question undecided. Those that it is coarse do not, as the ends say how coarse:
-of 53 runs with such a warning on 67 limit states with known p none had an interval without p.
+Warnings that p may be wrong leave it undecided. Those that p is coarse do not: of 53 runs with one on 67 limit states
+with known p, no interval was without p.
 
 Budget: simulations for a wished coefficient of variation, from a pilot.
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from samplers.mcmc import correlation_factor
 from samplers.sample import (
     PRIOR_SHARE,
     add_unseen,
     clopper_pearson,
     confidence_sequence,
-    correlation_factor,
     effective_sample_size,
     next_level,
     normalise_weights,
