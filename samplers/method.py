@@ -27,7 +27,6 @@ from samplers.sample import (
     normalise_weights,
 )
 
-
 MANY_FAILURES = 5
 """Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
 
