@@ -12,8 +12,8 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from samplers.mcmc import RootedPoints
-from samplers.method import Choice, Goal, Interrupted, Stepping, Steps, offer_of
-from samplers.methods.base import Method, marginalise_noise, noise_mask
+from samplers.method import Choice, Goal, Stepping, Steps, offer_of
+from samplers.methods.base import Method, noise_mask
 from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
@@ -24,7 +24,6 @@ from samplers.methods.surrogate import Surrogate, SurrogateRun
 from samplers.methods.two_stage.method import TwoStage
 from samplers.output import register_stored
 from samplers.problem import Inputs, check_name, check_settings
-from samplers.sample import Status
 
 FEW = 1000
 """Simulations up to which f is first learned by kriging; with more, `TwoStage` has the room for a search of its own."""
@@ -95,32 +94,21 @@ class Auto(Method):
         if budget > FEW:
             outcome = yield from TwoStage().steps(inputs, goal, rng)
             return replace(outcome, chosen=Choice(TwoStage(), f"two-stage: {size}"))
-        searched = marginalise_noise(inputs, rng)
-        run = SurrogateRun(searched, goal, budget, rng, may_leave=True)
+        run = SurrogateRun(inputs, goal, budget, rng, may_leave=True)
         found = yield from run.steps()
         if found is not None:
             how = ", failures foreseen" if run.learned else ""
             return replace(found, chosen=Choice(Surrogate(), f"surrogate: {size}{how}", unusual=True))
-        method = AdaptiveSubsetSimulation() if run.many else TwoStage()
         left = budget - len(run.f)
+        rest, method = replace(goal, max_sim=left), AdaptiveSubsetSimulation() if run.many else TwoStage()
+        if isinstance(method, AdaptiveSubsetSimulation):
+            known = RootedPoints(run.u, run.f, np.arange(len(run.f))) if run.inputs is inputs else None
+            steps = method.steps(inputs, rest, rng, known)
+        else:
+            steps = method.steps(inputs, rest, rng)
         why = f"kriging explains {max(100 * run.skill, 0):.0f} % of f" if run.many else "failures were not foreseen"
         choice = Choice(method, f"{method.name}: {size}, {why}; {left:,} simulations were left", unusual=True)
-        return replace((yield from _take_over(run, inputs, replace(goal, max_sim=left))), chosen=choice)
-
-
-def _take_over(run: SurrogateRun, inputs: Inputs, goal: Goal) -> Steps:
-    """Go on after a run that gave up: by subset simulation from its base draws, or by `TwoStage`."""
-    spent = len(run.f)
-    known = RootedPoints(run.u, run.f, np.arange(spent)) if run.many and run.inputs is inputs else None
-    try:
-        if run.many:
-            outcome = yield from AdaptiveSubsetSimulation().steps(inputs, goal, run.rng, known)
-        else:
-            outcome = yield from TwoStage().steps(inputs, goal, run.rng)
-    except Interrupted:
-        return run.estimate_early(Status.STOPPED)
-    weights = tuple(replace(each, first=spent + each.first) for each in outcome.draw_weights)
-    return replace(outcome, trace=(*run.simulator.trace, *outcome.trace), draw_weights=weights)
+        return replace((yield from run.go_on(steps)), chosen=choice)
 
 
 ENTRY_POINT_GROUP = "rare_envs.samplers"

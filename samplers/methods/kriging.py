@@ -21,29 +21,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_solve
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import log_ndtr
 
 from samplers.problem import FloatArray
 
 MANY_DIMS = 20  # In more the covariance has one length, and a linear part
-SMOOTHNESS = 2.5  # nu of the Matern covariance: f is taken as twice differentiable
-OUTCOME_SCALE = 2.0  # c of arcsinh(y / c) is this times the median of |y|
-TIE_SHARE = 0.05
-LEAST_TIES = 3  # From these shares and numbers of equal largest (least) outcomes on, these are a cap (floor) of f
-LEAST_UNCENSORED = 5  # With fewer other outcomes, those at a cap or floor are taken as they are at first
-IMPUTATIONS = 2  # Times that outcomes at a cap are replaced by their leave-one-out predictions
 MOST_INFLATION = 3.0
 """Standard deviations are inflated by the root mean square of standardised residuals, by no more."""
-HYPERPARAMETER_STEPS = 25  # Steps of L-BFGS in each search for covariance parameters
 REFIT_GROWTH = 1.4  # Covariance parameters are searched anew each time the points have grown by this factor
 MOST_POINTS = 200  # Points nearest to the limit state that they are searched with; a step costs their cube
-LARGEST = 1e300  # Larger outcomes stand for infinite ones
-IMPUTED_SPREAD = 3.0  # Replaced outcomes lie at most so many standard deviations beyond their bound
-JUST_FAILED = 1e-3  # Least depth of a failing outcome that is replaced, in compressed units
-LARGEST_SHIFT = 3.0  # Failure begins at most so many standard deviations of all outcomes from the limit state
-NEAR_LIMIT = 6.0  # Residuals count where the limit state is within so many standard deviations
 
 
 class Prediction(NamedTuple):
@@ -79,13 +67,6 @@ class Kriging:
         mean, sd = self.process.predict(u, return_std=True)
         return Prediction(mean - self.limit, np.maximum(sd, 1e-9) * self.inflation)
 
-    def covariance(self, u: FloatArray) -> tuple[FloatArray, float]:
-        """Return the posterior covariance of f without noise at u (n, d), (n, n), and the variance of the noise."""
-        smooth, nugget = self.process.kernel_.k1, self.process.kernel_.k2
-        half = solve_triangular(self.process.L_, smooth(u, self.process.X_train_).T, lower=True)
-        square = self.inflation**2
-        return np.asarray(square * (smooth(u) - half.T @ half)), float(square * nugget.noise_level)
-
 
 class Outcomes(NamedTuple):
     """Compressed outcomes, shape (n,), and which of them are only bounds."""
@@ -96,9 +77,9 @@ class Outcomes(NamedTuple):
 
     def impute(self, predicted: FloatArray) -> FloatArray:
         """Return the outcomes with those that are bounds replaced by predictions within them, shape (n,)."""
-        spread = IMPUTED_SPREAD * float(self.z.std())
+        spread = 3.0 * float(self.z.std())  # replaced outcomes lie at most so far beyond their bound
         z = np.where(self.capped, np.clip(predicted, self.z, self.z + spread), self.z)
-        return np.where(self.floored, np.clip(predicted, self.z - spread, -JUST_FAILED), z)
+        return np.where(self.floored, np.clip(predicted, self.z - spread, -1e-3), z)
 
 
 def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> Kriging:
@@ -110,8 +91,8 @@ def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> 
         kernel, scale, n_searched, search = before.process.kernel_, before.scale, before.n_searched, False
     outcomes = compress_outcomes(y, scale)
     z, free = outcomes.z, ~(outcomes.capped | outcomes.floored)
-    turns = 0 if free.all() else IMPUTATIONS
-    if turns and free.sum() >= LEAST_UNCENSORED:
+    turns = 0 if free.all() else 2  # of replacing those at a cap by what the others predict
+    if turns and free.sum() >= 5:  # enough to begin without them
         process, _, mean, sd = _fit_process(kernel, u[free], z[free], search=search)
         kernel, z = process.kernel_, outcomes.impute(mean + sd * process.predict(u))
     for turn in range(1 + turns):
@@ -121,7 +102,7 @@ def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> 
         if turn < turns:
             z = outcomes.impute(mean + sd * left_out)
     limit, residuals = -mean / sd, (standard - left_out) / left_out_sd
-    near = np.abs(left_out - limit) < NEAR_LIMIT * left_out_sd
+    near = np.abs(left_out - limit) < 6 * left_out_sd
     inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0
     inflation = min(max(inflation, 1.0), MOST_INFLATION)
     if outcomes.floored.any():  # these do not tell where f would be 0
@@ -141,20 +122,20 @@ def _find_shift(mean: FloatArray, sd: FloatArray, fails: NDArray[np.bool_]) -> f
     def loss(shift: float) -> float:
         return 0.5 * shift**2 - float(log_ndtr(sign * (shift - mean) / np.maximum(sd, 1e-9)).sum())
 
-    return float(minimize_scalar(loss, bounds=(-LARGEST_SHIFT, LARGEST_SHIFT), method="bounded").x)
+    return float(minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded").x)
 
 
 def outcome_scale(y: FloatArray) -> float:
     """Return the scale c of outcomes y = f - gamma (n,)."""
-    sizes = np.abs(y[(np.abs(y) < LARGEST) & (y != 0)])
-    return OUTCOME_SCALE * (float(np.median(sizes)) if len(sizes) else 1.0)
+    sizes = np.abs(y[(np.abs(y) < 1e300) & (y != 0)])  # larger ones stand for infinity
+    return 2 * float(np.median(sizes)) if len(sizes) else 2.0
 
 
 def compress_outcomes(y: FloatArray, scale: float) -> Outcomes:
     """Return compressed outcomes of y = f - gamma (n,), and which of them stand at a cap or floor of f."""
-    size = float(np.abs(y[np.abs(y) < LARGEST]).max(initial=0.0)) or 1.0  # stands for infinity
+    size = float(np.abs(y[np.abs(y) < 1e300]).max(initial=0.0)) or 1.0  # stands for infinity
     y = np.clip(y, -size, size)
-    ties = max(LEAST_TIES, TIE_SHARE * len(y))
+    ties = max(3, 0.05 * len(y))
     capped, floored = (y == y.max()) & (y > 0), (y == y.min()) & (y <= 0)
     return Outcomes(np.arcsinh(y / scale), capped & (capped.sum() >= ties), floored & (floored.sum() >= ties))
 
@@ -165,7 +146,7 @@ def _initial_kernel(dim: int) -> Any:
 
     length = 2.0 * math.sqrt(dim)  # about the distance between two draws
     lengths = np.full(dim, length) if dim <= MANY_DIMS else length
-    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * Matern(lengths, (0.2, 100.0), nu=SMOOTHNESS)
+    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * Matern(lengths, (0.2, 100.0), nu=2.5)  # twice differentiable
     if dim > MANY_DIMS:
         smooth += ConstantKernel(1.0 / dim, (1e-5, 1e2)) * DotProduct(0.0, "fixed")
     return smooth + WhiteKernel(1e-4, (1e-8, 1.0))
@@ -176,7 +157,7 @@ def _fit_process(kernel: Any, u: FloatArray, z: FloatArray, *, search: bool) -> 
     from sklearn.gaussian_process import GaussianProcessRegressor
 
     def climb(loss: Any, start: Any, bounds: Any) -> tuple[FloatArray, float]:
-        options: Any = {"maxiter": HYPERPARAMETER_STEPS}
+        options: Any = {"maxiter": 25}
         found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return found.x, found.fun
 

@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtri
 
 from samplers.distributions import Gaussian
-from samplers.importance import Draws, Search, count_final_draws, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps
+from samplers.importance import Draws, count_final_draws, weighted_interval
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.kriging import MANY_DIMS, Kriging, Prediction, fit_kriging
+from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.two_stage.regions import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Mixture, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import (
+    DrawWeights,
+    Sample,
     Status,
     add_unseen,
     clopper_pearson,
@@ -45,15 +48,17 @@ DOUBT = 4.0
 close together, so that their residuals say little of what is between them."""
 FORECAST_COV = 0.02  # Learning ends where the draws left would give this c.o.v., in two batches one after the other
 FINAL_POOL = 20_000  # Draws of the last pool; its own error is 1 / sqrt(those that may fail), a part of the c.o.v.
-LEAST_FITTED = 30  # Effective draws of a pool that a mixture is fitted to at least
-PARTS = SURROGATE, BASE, WIDE, DOUBTED = range(4)
-"""Parts of a proposal: what the surrogate says, base draws, wide draws, and what it would say if it were doubted."""
-PART_SHARES = np.array([0.7, 0.1, 0.05, 0.15])
-"""Shares of the parts. No weight exceeds 1 / the share of base draws but for the error of the pool; wide draws meet
-regions that the surrogate denies, with small weights. On the IDM cut-in, 300 simulations, 10 seeds: without doubted
+PART_SHARES, BASE = np.array([0.75, 0.1, 0.15]), 1
+"""Shares of what the surrogate says, of base draws, and of what it would say if it were doubted. No weight exceeds
+1 / the share of base draws but for the error of the pool. On the IDM cut-in, 300 simulations, 10 seeds: without doubted
 draws and random points 8 of 10 intervals held p and the gain was 34; with doubted draws alone 10 and 76, with both 10
 and 190."""
 LEAST_ESS = 10.0  # Effective failing draws below which the upper end is Bernstein's bound, or that of the base draws
+LEAST_SKILL = 0.4
+"""Share of the variance of f that is to be predicted of points left out, in many dimensions: with 100 base draws it is
+0.41 to 0.95 where one or two planes or a sum of claims fail, 0.28 for four planes, up to 0.13 for a ring or a first
+passage, where nothing is to be learned from a few hundred simulations."""
+LEAST_LEFT = 600  # Simulations that another method is to have if it takes over where f is not learned
 
 
 class Pool(NamedTuple):
@@ -91,12 +96,10 @@ class Pool(NamedTuple):
 
     def temper(self) -> FloatArray:
         """Return the logarithms of the proposal (N,); of a smaller power of P[fail] where few carry its weight."""
-        low, high = 0.0, 0.5
-        for _ in range(12 if effective_sample_size(self.log_proposal) < LEAST_FITTED else 0):
-            power = 0.5 * (low + high)
-            enough = effective_sample_size(self.log_weights + power * self.prediction.log_fail) >= LEAST_FITTED
-            low, high = (power, high) if enough else (low, power)
-        return self.log_weights + high * self.prediction.log_fail
+        power = 0.5
+        while power > 0.01 and effective_sample_size(self.log_weights + power * self.prediction.log_fail) < 30:
+            power *= 0.8  # 30 are enough to fit a mixture to
+        return self.log_weights + power * self.prediction.log_fail
 
 
 def log_density_ratio(u: FloatArray, mixture: Mixture) -> FloatArray:
@@ -119,101 +122,33 @@ def fit_mixture(pool: Pool, rng: np.random.Generator) -> Mixture:
     return Mixture(shares, [*isotropic_mixture(dim).components, fitted.widen(wider)])
 
 
-class PoolProposal(NamedTuple):
-    """The probabilities with which draws of a pool are simulated, for each of `PARTS`."""
-
-    pool: Pool
-    probabilities: FloatArray  # of each part, (4, N)
-    log_wide_weights: FloatArray  # log(phi / wide), (N,)
-
-    @classmethod
-    def build(cls, pool: Pool) -> "PoolProposal":
-        """Return the proposal for the estimate."""
-        log_wide_weights = log_density_ratio(pool.u, isotropic_mixture(pool.u.shape[1], SCALES[1:]))
-        logs = (pool.log_proposal, pool.log_weights, pool.log_weights - log_wide_weights, pool.doubted.log_proposal)
-        return cls(pool, np.array([normalise_weights(log) for log in logs]), log_wide_weights)
-
-    def draw(self, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
-        """Draw n of the pool: return their rows, log(w / (N b)) and the part that each was drawn from, (n,) each."""
-        part = rng.choice(len(PARTS), n, p=PART_SHARES)
-        chosen = np.empty(n, dtype=np.int64)
-        for k in PARTS:
-            chosen[part == k] = rng.choice(len(self.pool.u), int((part == k).sum()), p=self.probabilities[k])
-        probability = PART_SHARES @ self.probabilities[:, chosen]
-        log_weights = self.pool.log_weights[chosen] - np.log(len(self.pool.u) * probability)
-        return chosen, log_weights, part
+def draw_to_simulate(pool: Pool, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Choose n draws of a pool to simulate for the estimate: their rows, log(w / (N b)), and 1 for base draws, (n,)."""
+    logs = pool.log_proposal, pool.log_weights, pool.doubted.log_proposal
+    parts = np.array([normalise_weights(log) for log in logs])
+    part = rng.choice(len(parts), n, p=PART_SHARES)
+    rows = np.empty(n, dtype=np.int64)
+    for k in range(len(parts)):
+        rows[part == k] = rng.choice(len(pool.u), int((part == k).sum()), p=parts[k])
+    return rows, pool.log_weights[rows] - np.log(len(pool.u) * (PART_SHARES @ parts[:, rows])), part == BASE
 
 
-def choose_batch(kriging: Kriging, pool: Pool, n: int, rng: np.random.Generator) -> FloatArray:
-    """Choose the next n points to learn from, shape (n, d).
+def choose_batch(pool: Pool, n: int, rng: np.random.Generator) -> FloatArray:
+    """Choose the next n points of a pool to learn from, shape (n, d), without replacement.
 
-    Of candidates drawn as phi sqrt(P[fail] P[safe]) the most doubtful one by one (least |mean| / sd, Echard et al.
-    2011), each lowering the others' variances; three in ten at random where a doubted surrogate leaves both open, far
-    from its limit state, which tell whether it is right there.
+    Seven in ten where the surrogate leaves open whether they fail, as phi sqrt(P[fail] P[safe]); the others where it
+    would if it were doubted, far from its limit state, which tell whether it is right there.
     """
-    log_open, most = pool.log_open, 40 * n
-    weights = normalise_weights(log_open)
-    among = np.unique(rng.choice(len(pool.u), min(most, int(np.count_nonzero(weights))), p=weights))
-    if len(among) < n:  # nearly all weight lies on few draws
-        among = np.argsort(log_open)[-most:]
-    u, mean = pool.u[among], pool.prediction.mean[among]
-    covariance, noise = kriging.covariance(u)
-    chosen = list[int]()
-    n_random = int(0.3 * n)
-    for _ in range(min(n - n_random, len(among))):
-        doubt = -np.abs(mean) / np.sqrt(np.maximum(np.diag(covariance), 0.0) + noise + 1e-12)
-        doubt[chosen] = -np.inf
-        best = int(doubt.argmax())
-        chosen.append(best)
-        column = covariance[:, best]
-        covariance = covariance - np.outer(column, column) / (column[best] + noise + 1e-12)
-    keys = pool.doubted.log_open + rng.gumbel(size=len(pool.u))  # the largest: draws without replacement
-    keys[among[chosen]] = -np.inf
-    return np.concatenate([u[chosen], pool.u[np.argsort(-keys, kind="stable")[:n_random]]])
-
-
-class HeldOut(NamedTuple):
-    """Points (n,) that were predicted before they were simulated: P[fail], and whether they failed."""
-
-    predicted: FloatArray = np.empty(0)
-    fails: NDArray[np.bool_] = np.empty(0, dtype=bool)
-
-    def add(self, predicted: FloatArray, fails: NDArray[np.bool_]) -> "HeldOut":
-        """Return these and others."""
-        return HeldOut(np.concatenate([self.predicted, predicted]), np.concatenate([self.fails, fails]))
-
-    def last(self, n: int) -> "HeldOut":
-        """Return the last n."""
-        return HeldOut(self.predicted[-n:], self.fails[-n:])
-
-    @property
-    def right(self) -> int:
-        """How many fell on the side that was predicted."""
-        return int(((self.predicted > 0.5) == self.fails).sum())
-
-    @property
-    def foreseen(self) -> bool:
-        """Whether as many failed as predicted, within 1.5 standard errors; at unforeseen jumps all do, or none."""
-        allowed = 1.5 * math.sqrt(2 * float((self.predicted * (1 - self.predicted)).sum()) + 1)
-        return abs(float(self.fails.sum() - self.predicted.sum())) <= allowed
-
-    @property
-    def misjudged(self) -> bool:
-        """Whether fewer fell on the side predicted than the predictions themselves allow, by 3 standard errors."""
-        sure = np.maximum(self.predicted, 1 - self.predicted)
-        return self.right < float(sure.sum()) - 3 * math.sqrt(float((sure * (1 - sure)).sum()) + 1)
-
-
-LEAST_SKILL = 0.4
-"""Share of the variance of f that is to be predicted of points left out, in many dimensions: with 100 base draws it is
-0.41 to 0.95 where one or two planes or a sum of claims fail, 0.28 for four planes, up to 0.13 for a ring or a first
-passage, where nothing is to be learned from a few hundred simulations."""
-LEAST_LEFT = 600
-"""Simulations that another method is to have if it takes over where f is not learned."""
+    n_far = int(0.3 * n)
+    keys = pool.log_open + rng.gumbel(size=len(pool.u))  # the largest: draws without replacement
+    near = np.argsort(-keys, kind="stable")[: n - n_far]
+    keys = pool.doubted.log_open + rng.gumbel(size=len(pool.u))
+    keys[near] = -np.inf
+    return np.take(pool.u, np.append(near, np.argsort(-keys, kind="stable")[:n_far]), axis=0)
 
 
 class SurrogateRun:
-    """One run, with what has been simulated so far; `inputs` are without coordinates that are noise.
+    """One run, with what has been simulated so far.
 
     Where `may_leave`, the run gives up when f is not learned and another method would do better with the rest: `steps`
     then returns None.
@@ -222,15 +157,17 @@ class SurrogateRun:
     def __init__(
         self, inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, may_leave: bool = False
     ) -> None:
-        self.inputs, self.goal, self.budget, self.rng, self.may_leave = inputs, goal, budget, rng, may_leave
-        self.simulator = Simulator(inputs, goal)
-        self.u, self.f = np.empty((0, inputs.dim)), np.empty(0)
-        self.many = inputs.dim > MANY_DIMS
+        self.whole, self.inputs = inputs, marginalise_noise(inputs, rng)
+        self.goal, self.budget, self.rng, self.may_leave = goal, budget, rng, may_leave
+        self.simulator = Simulator(self.inputs, goal)
+        dim = self.inputs.dim
+        self.u, self.f = np.empty((0, dim)), np.empty(0)
+        self.many = dim > MANY_DIMS
         self.scales = (1.0,) if self.many else SCALES  # of the first design; wide draws say little in many dimensions
-        size = min(budget // 3, 100) if self.many else min(budget // 4, 30 + 10 * inputs.dim)
+        size = min(budget // 3, 100) if self.many else min(budget // 4, 30 + 10 * dim)
         self.n_base = max(size // len(self.scales), 1)
         self.n_design, self.failing_batches = self.n_base * len(self.scales), 0
-        self.held_out, self.learned, self.skill = HeldOut(), False, 0.0
+        self.learned, self.skill = False, 0.0  # whether failures were foreseen; the share of f predicted of base draws
 
     def steps(self) -> Generator[FloatArray, FloatArray, Outcome | None]:
         """Learn; then estimate, or leave it to plain Monte Carlo."""
@@ -266,14 +203,19 @@ class SurrogateRun:
 
     def draw_base(self) -> Steps:
         """Spend the rest on base draws; those of the design do not count, for they may have decided it."""
-        goal, left, search = self.goal, self.budget - len(self.f), Search(self.inputs, self.goal, self.rng)
-        limit = count_final_draws(goal, len(self.f), left)
-        draws = yield from search.draw_final(search.base, limit, max(left, 1), goal.target_cov)
-        stopped = search.status is Status.STOPPED
-        if draws.n == 0:
-            return self.estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        status, trace = Status.STOPPED if stopped else Status.CONVERGED, (*self.simulator.trace, *search.trace)
-        return draws.outcome(goal, status, trace, 1.0, draws.n)
+        left = self.budget - len(self.f)
+        goal = self.goal if self.goal.max_sim is None else replace(self.goal, max_sim=left)
+        outcome = yield from self.go_on(MonteCarlo(n=left, batch=left).steps(self.whole, goal, self.rng))
+        return replace(outcome, counts=None)  # no share of draws to be pooled: this run came to it by chance
+
+    def go_on(self, steps: Steps) -> Steps:
+        """Leave the rest to another method; return its outcome as that of the whole run."""
+        try:
+            outcome = yield from steps
+        except Interrupted:
+            return self.estimate_early(Status.STOPPED)
+        weights = tuple(replace(each, first=len(self.f) + each.first) for each in outcome.draw_weights)
+        return replace(outcome, trace=(*self.simulator.trace, *outcome.trace), draw_weights=weights)
 
     def _simulate(self, u: FloatArray) -> SimulationSteps[FloatArray]:
         """Simulate u (n, d) to learn from; return their outcomes (n,)."""
@@ -292,26 +234,28 @@ class SurrogateRun:
         if self.may_leave and not self.many and self.budget >= LEAST_LEFT + 200:
             most = 200
         size = max((most - self.n_design) // 16, 6)  # simulators run the points of one batch side by side
-        mixture, good = isotropic_mixture(self.inputs.dim), 0
+        mixture, good, surprises = isotropic_mixture(self.inputs.dim), 0, list[float]()
         while len(self.f) < most and good < 2:
             pool = Pool.draw(kriging, mixture, 3000, self.rng)
-            batch = choose_batch(kriging, pool, min(size, most - len(self.f)), self.rng)
+            batch = choose_batch(pool, min(size, most - len(self.f)), self.rng)
             predicted = np.exp(kriging.predict(batch).log_fail)
             fails = (yield from self._simulate(batch)) <= self.goal.gamma
-            self.held_out = self.held_out.add(predicted, fails)
             self.failing_batches += bool(fails.any())
+            surprises.append(float(fails.sum() - predicted.sum()))
+            # 1.5 standard errors of two batches: at a limit state that is elsewhere all of their points fail, or none
+            allowed = 1.5 * math.sqrt(2 * float((predicted * (1 - predicted)).sum()) + 1)
             sharp = fails.any() and pool.forecast_cov(self.budget - len(self.f)) < FORECAST_COV
-            good = good + 1 if sharp and self.held_out.last(2 * size).foreseen else 0
+            good = good + 1 if sharp and abs(sum(surprises[-2:])) <= allowed else 0
             mixture = fit_mixture(pool, self.rng)
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging)
         self.learned = good == 2
         return kriging, mixture
 
-    def _build_proposal(self, kriging: Kriging, mixture: Mixture) -> tuple[PoolProposal, Mixture]:
-        """Return the proposal for the estimate, and the mixture of its pool."""
+    def _draw_pool(self, kriging: Kriging, mixture: Mixture) -> tuple[Pool, Mixture]:
+        """Return the pool for the estimate, and its mixture."""
         for _ in range(3):
             mixture = fit_mixture(Pool.draw(kriging, mixture, FINAL_POOL // 4, self.rng), self.rng)
-        return PoolProposal.build(Pool.draw(kriging, mixture, FINAL_POOL, self.rng)), mixture
+        return Pool.draw(kriging, mixture, FINAL_POOL, self.rng), mixture
 
     def _estimate(self, kriging: Kriging, mixture: Mixture) -> Steps:
         """Draw until the budget is used or the target is met; p rests on these draws alone.
@@ -320,14 +264,13 @@ class SurrogateRun:
         """
         goal, cov, status = self.goal, math.inf, Status.CONVERGED
         draws = Draws(0, np.empty(0), np.empty(0))
-        kinds = np.zeros((2, 4), dtype=np.int64)  # draws and failing draws by part of the proposal
-        wide = self._design_log_weights()[self.f[: self.n_design] <= goal.gamma]
+        of_base = self.f[: self.n_base]  # outcomes of base draws
         left = count_final_draws(goal, len(self.f), self.budget - len(self.f))
-        proposal, mixture = self._build_proposal(kriging, mixture)
+        pool, mixture = self._draw_pool(kriging, mixture)
         size = min(1000, math.ceil(left / 2)) if goal.target_cov is None else max(self.budget // 10, 1)
         while left > 0 and not (goal.target_cov is not None and draws.n and cov <= goal.target_cov):
-            chosen, log_weights, part = proposal.draw(min(size, left), self.rng)
-            u = proposal.pool.u[chosen]
+            rows, log_weights, from_base = draw_to_simulate(pool, min(size, left), self.rng)
+            u = pool.u[rows]
             x = self.inputs.base.from_standard_normal(u)
             try:
                 f = yield from self.simulator.simulate(x)
@@ -336,84 +279,68 @@ class SurrogateRun:
                 break
             fails = f <= goal.gamma
             draws = draws.join(Draws.from_outcomes(f, log_weights, x, goal.gamma))
-            kinds += [np.bincount(each, minlength=4) for each in (part, part[fails])]
-            wide = np.concatenate([wide, proposal.log_wide_weights[chosen][fails & (part == WIDE)]])
-            may_fail = effective_sample_size(proposal.pool.log_weights + proposal.pool.prediction.log_fail)
+            of_base = np.concatenate([of_base, f[from_base]])
+            may_fail = effective_sample_size(pool.log_weights + pool.prediction.log_fail)
             cov = math.hypot(draws.cov, math.sqrt(1 / may_fail))
             left -= len(f)
             self.simulator.record(float(fails.mean()), draws.p, len(f), cov, draws.ess)
             if left > 0 and draws.n < 1000:  # kriging costs the cube of their number
                 self._keep(u, f)
                 kriging = fit_kriging(self.u, self.f - goal.gamma, kriging)
-                proposal, mixture = self._build_proposal(kriging, mixture)
+                pool, mixture = self._draw_pool(kriging, mixture)
         if draws.n == 0:
             return self.estimate_early(status if status is Status.STOPPED else Status.BUDGET)
-        largest = float(np.exp(logsumexp(proposal.pool.log_weights))) / (FINAL_POOL * float(PART_SHARES[BASE]))
-        outcome = self._outcome(draws, cov, largest, status)
-        lineages = max(count_lineages(self.failing_batches, wide), 1.0)
-        low, high = outcome.interval[0], add_unseen(draws.p, outcome.interval[1], lineages, goal.confidence)
-        n, hits = self.n_base + kinds[0, BASE], (self.f[: self.n_base] <= goal.gamma).sum() + kinds[1, BASE]
+        largest = float(np.exp(logsumexp(pool.log_weights))) / (FINAL_POOL * float(PART_SHARES[BASE]))
+        design = self.u[: self.n_design][self.f[: self.n_design] <= goal.gamma]
+        wide = log_density_ratio(design, isotropic_mixture(self.inputs.dim, self.scales))
+        lineages, none = max(count_lineages(self.failing_batches, wide), 1.0), len(draws.f) == 0
         if draws.ess < LEAST_ESS:  # what the base draws alone say may be more
-            high = max(draws.p, min(high, clopper_pearson(int(hits), int(n), goal.confidence)[1]))
-        held = self.held_out
-        poor = f"Kriging placed {held.right} of {len(held.fails)} new points on the right side, fewer than it promised."
+            low, high = weighted_interval(draws, goal.confidence, largest, cov)
+            most = clopper_pearson(int((of_base <= goal.gamma).sum()), len(of_base), goal.confidence)[1]
+        else:
+            freedom, most = degrees_of_freedom(draws.ess, independent=True), 1.0
+            low, high = log_normal_interval(draws.p, cov, goal.confidence, freedom)
+        high = max(draws.p, min(add_unseen(draws.p, high, lineages, goal.confidence), most))
+        outcome = draws.outcome(goal, status, self.simulator.trace, largest, len(of_base) - self.n_base)
         return replace(
             outcome,
-            interval=(low, high),
-            warnings=(*outcome.warnings, *([poor] if held.misjudged else [])),
-            base_draws=int(kinds[0, BASE]),
+            p=min(draws.p, 1.0),
+            interval=(low, min(high, 1.0)),
+            cov=cov,
+            status=Status.NO_HITS if status is Status.CONVERGED and none else status,
+            warnings=outcome.warnings if none else (),
+            remarks=() if none else outcome.warnings,  # few draws are the rule here, and the interval says it
             sample=replace(draws.sample, lineages=lineages),
         )
 
-    def _design_log_weights(self) -> FloatArray:
-        """Return log(phi / q) of the points of the design, q the equal mixture of its scales."""
-        return log_density_ratio(self.u[: self.n_design], isotropic_mixture(self.inputs.dim, self.scales))
-
     def estimate_early(self, status: Status) -> Outcome:
-        """Return what the first design says, for a run that ends before its estimate."""
-        n = self.n_design
-        x = self.inputs.base.from_standard_normal(self.u[:n])
-        draws = Draws.from_outcomes(self.f[:n], self._design_log_weights(), x, self.goal.gamma)
-        outcome = self._outcome(draws, draws.cov, float(len(self.scales)), status)
-        return replace(outcome, draw_weights=draws.weights_after(0))
-
-    def _outcome(self, draws: Draws, cov: float, largest_weight: float, status: Status) -> Outcome:
-        """Return what weighted draws say of p; that they are few is a remark here, as it is the rule."""
-        none, confidence = len(draws.f) == 0, self.goal.confidence
-        if draws.ess < LEAST_ESS:
-            interval = weighted_interval(draws, confidence, largest_weight, cov)
-        else:
-            freedom = degrees_of_freedom(draws.ess, independent=True)
-            interval = log_normal_interval(draws.p, cov, confidence, freedom)
-        found = draws.outcome(self.goal, status, self.simulator.trace, largest_weight, 0)
-        return replace(
-            found,
-            p=min(draws.p, 1.0),
-            interval=interval,
-            cov=cov,
-            status=Status.NO_HITS if status is Status.CONVERGED and none else status,
-            warnings=found.warnings if none else (),
-            remarks=() if none else found.warnings,
-        )
+        """Return what the base draws of the first design say, for a run that ends before its estimate."""
+        f, n = self.f[: self.n_base], self.n_base
+        fails = f <= self.goal.gamma
+        trace = self.simulator.close_trace()
+        outcome = Outcome.of_counts(int(fails.sum()), n, self.goal.confidence, trace, no_outcome_share(f[fails]))
+        sample = Sample.of_equal_draws(f, self.inputs.base.from_standard_normal(self.u[:n][fails]))
+        weights = (DrawWeights.of_equal_draws(n, 0, n),)
+        return replace(outcome, counts=None, status=status, sample=sample, draw_weights=weights)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surrogate(Method):
     """Kriging as a guide and importance sampling on the simulator: for 100 to 1,000 simulations where f is smooth.
 
-    1. *Learning* (`kriging.py`): a first design of Latin hypercubes of N(0, s^2 I), s = 1 to 3, then
-       batches where phi sqrt(P[fail] P[safe]) is large, P by kriging; three in ten points are drawn where the surrogate
-       would see doubt if its standard deviations were four times as large. It takes two thirds of the budget at most,
-       and ends earlier where the rest is forecast to give a c.o.v. of 2 %.
-    2. *Estimate*: fresh draws from 70 % q ~ phi sqrt(P[fail]), 15 % the same with these
-       larger standard deviations, 10 % base distribution, 5 % wide distributions, weighted by phi over the density of
-       this mixture, and nothing else. The surrogate only says where to simulate, and learns from the first half of the
-       draws before the second is made. Given the learning p-hat is unbiased; its c.o.v. includes the error of the
-       density's constant, which is a mean over a pool of 20,000 draws that are not simulated.
+    1. *Learning* (`kriging.py`): a first design of Latin hypercubes of N(0, s^2 I), s = 1 to 3, then batches: seven in
+       ten points where phi sqrt(P[fail] P[safe]) is large, P by kriging, the others where it would be with standard
+       deviations four times as large. It takes two thirds of the budget at most, and ends earlier where the failures
+       of two batches were foreseen and the rest is forecast to give a c.o.v. of 2 %.
+    2. *Estimate*: fresh draws, 75 % of q ~ phi sqrt(P[fail]), 15 % of the same with the larger standard deviations,
+       10 % of the base distribution, weighted by phi over the density of this mixture, and nothing else. The surrogate
+       only says where to simulate, and learns from the first half of the draws before the second is made. Given the
+       learning p-hat is unbiased; its c.o.v. includes the error of the density's constant, which is a mean over a pool
+       of 20,000 draws that are not simulated.
 
-    *Interval.* Log-normal with t quantiles, Bernstein's bound where under 10 effective draws failed. The upper end also
-    holds what no draw can have met (`two_stage/regions.py`, a batch of learning with failures as a lineage).
-    With a few hundred simulations that is a large part of it.
+    *Interval.* Log-normal with t quantiles; where under 10 effective draws failed the lesser of Bernstein's bound and
+    that of the base draws. The upper end also holds what no draw can have met (`two_stage/regions.py`, a batch of
+    learning with failures as a lineage). With a few hundred simulations that is a large part of it.
 
     *Noise.* Coordinates that the base distribution calls noise are drawn, not learned; kriging takes what they do to f,
     and noise that is no part of x, as a nugget.
@@ -423,9 +350,8 @@ class Surrogate(Method):
     *Plain Monte Carlo takes over*, with a remark, where learning meets no failure and below 60 simulations; without one
     where a tenth of the first base draws fails.
 
-    Where Dubourg, Sudret and Deheeger and this implementation differ: they draw from P[fail] phi by Markov chains, we
-    choose from weighted draws of a mixture, which gives independent draws; they have no base and wide draws, so that
-    failures that the surrogate denies have unbounded weights; f is taken as capped, floored and noisy (`kriging.py`).
+    Dubourg, Sudret and Deheeger draw from P[fail] phi by Markov chains; we choose from weighted draws of a mixture,
+    which gives independent draws, and add base draws, which bound the weights of failures that the surrogate denies.
 
     Args:
         n: Simulations where `max_sim` does not say how many.
@@ -433,8 +359,6 @@ class Surrogate(Method):
     References:
         Dubourg, Sudret and Deheeger, "Metamodel-based importance sampling for structural reliability analysis",
         Probabilistic Engineering Mechanics 33, 2013.
-        Echard, Gayton and Lemaire, "AK-MCS: an active learning reliability method combining kriging and Monte Carlo
-        simulation", Structural Safety 33, 2011 (what to learn from).
 
     Example:
         Two regions of failure, p = 2 Phi(-3.5) = 4.65e-4:
@@ -458,6 +382,6 @@ class Surrogate(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Learn, then estimate."""
         budget = self.n if goal.max_sim is None else goal.max_sim
-        outcome = yield from SurrogateRun(marginalise_noise(inputs, rng), goal, budget, rng).steps()
+        outcome = yield from SurrogateRun(inputs, goal, budget, rng).steps()
         assert outcome is not None  # it was not to leave
         return outcome

@@ -8,7 +8,7 @@ from scipy.stats import norm
 import samplers
 from samplers.limit_states import half_space, two_modes
 from samplers.methods.kriging import Prediction, compress_outcomes, fit_kriging, outcome_scale
-from samplers.methods.surrogate import Pool, PoolProposal, isotropic_mixture
+from samplers.methods.surrogate import Pool, draw_to_simulate, isotropic_mixture
 from samplers.problem import FunctionProblem, StandardNormal
 
 
@@ -30,7 +30,7 @@ def test_the_estimate_is_unbiased_whatever_the_surrogate_says(seen_as, expected)
     rng, estimates = np.random.default_rng(1), []
     for seed in range(300):
         pool = pool_of(lambda u: seen_as - u[:, 0], n=1000, seed=seed)
-        chosen, log_weights, _ = PoolProposal.build(pool).draw(60, rng)
+        chosen, log_weights, _ = draw_to_simulate(pool, 60, rng)
         estimates.append(np.exp(log_weights)[pool.u[chosen, 0] > 2.0].sum() / 60)
     error = np.std(estimates, ddof=1) / np.sqrt(300)
     assert abs(np.mean(estimates) - norm.sf(2.0)) < 4 * error
