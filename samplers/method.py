@@ -449,7 +449,8 @@ class KeptDraws:
 
     def outcome(self, goal: Goal, trace: list[Level]) -> Outcome:
         """Return the outcome of a run that ends with them; kept draws stand for all, and their weights make p exact."""
-        (hits, n), f, x, failing = self.counts, *map(np.concatenate, (self._f, self._x, self._f_failing))
+        (hits, n), f = self.counts, np.concatenate(self._f)
+        x, failing = np.concatenate(self._x), np.concatenate(self._f_failing)
         if len(f) == n and len(x) == hits:
             sample = Sample.of_equal_draws(f, x)
         else:

@@ -238,8 +238,6 @@ class Estimate(EstimateData, Kept):
         """What is not in p and its interval: what the problem holds fixed, and regions of failure that no draw met."""
         fixed = f"given that {self.given}; " if self.given else ""
         by = f"({self.base_draws:,} base draws, {100 * self.confidence:g} % confidence)"
-        if self.p == 0 and self.failures.total == 0 < self.base_draws:  # the interval itself is about what was missed
-            return f"{fixed}no draw met a failure: p is below {self.unseen:.1e} {by}"
         wide = sum(n for _, n in self.wide_draws)
         corner = f"; a corner of three planes: below {self.unseen_corner:.0e} ({wide:,} wide draws)" if wide else ""
         return f"{fixed}a failure region that no draw met: below {self.unseen:.1e} {by}{corner}"
@@ -278,12 +276,8 @@ class Estimate(EstimateData, Kept):
         return f"P[f <= {self.gamma:g}] below {self.interval[1]:.1e} ({100 * self.confidence:g} %): {about}"
 
     def __repr__(self) -> str:
-        low, high = self.interval
-        doubts = f", {len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}" if self.warnings else ""
-        return (
-            f"<Estimate P[f <= {self.gamma:g}] = {self.p:.3e} [{low:.3e}, {high:.3e}], {self.n_sim:,} simulations, "
-            f"{self.method.name}, {self.status}{doubts}>"
-        )
+        ends, ended = "[{:.3e}, {:.3e}]".format(*self.interval), describe_outcome(self.status, self.warnings)
+        return f"<Estimate {self._headline} {ends}, {self.n_sim:,} simulations, {self.method.name}, {ended}>"
 
     def __str__(self) -> str:
         (low, high), looks = self.interval, self.sequence

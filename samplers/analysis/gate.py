@@ -83,10 +83,9 @@ class Verdict(Reported):
         what, sure = f"{self.quantity} is", f"{100 * self.confidence:.4g} % confidence"
         base = ", the base distribution's uncertainty included" if self.includes_base else ""
         low, high = (format(end, ".2e" if self.high < 0.01 else ".3g") for end in (self.low, self.high))
-        if self.decision == "passes":
-            return f"passes: {what} below {self.limit:g} with {sure} (one-sided upper end {high}{base})"
-        if self.decision == "fails":
-            return f"fails: {what} above {self.limit:g} with {sure} (one-sided lower end {low}{base})"
+        if self.decision != "undecided":
+            side, end = ("below", f"upper end {high}") if self else ("above", f"lower end {low}")
+            return f"{self.decision}: {what} {side} {self.limit:g} with {sure} (one-sided {end}{base})"
         if self.reason:
             return f"undecided: whether {what} below {self.limit:g} cannot be said, as {self.reason}"
         ends = f"{low} and {high}, at {sure}{base}"

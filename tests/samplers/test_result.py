@@ -75,7 +75,7 @@ def test_without_a_failure_it_says_which_bound_has_which_level():
     assert data["cov"] is None and data["gain"] is None  # no infinities
     assert "warning: None of 1,000 simulations failed" in text and "c.o.v. not known" in text and "gain" not in text
     assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
-    assert estimate.proviso == "no draw met a failure: p is below 3.0e-03 (1,000 base draws, 95 % confidence)"
+    assert estimate.proviso == "a failure region that no draw met: below 3.0e-03 (1,000 base draws, 95 % confidence)"
 
 
 def test_says_what_the_problem_holds_fixed():

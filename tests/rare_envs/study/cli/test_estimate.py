@@ -44,7 +44,7 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, t
     assert result.exit_code == 0
     assert "warning: " not in result.stdout
     assert "remark: None of 2,000 simulations failed: p = 0 with a one-sided interval." in result.stdout
-    assert "no draw met a failure: p is below 1.5e-03 (2,000 base draws, 95 % confidence)" in result.stdout
+    assert "a failure region that no draw met: below 1.5e-03 (2,000 base draws, 95 % confidence)" in result.stdout
     written = json.loads((tmp_path / "run" / "result.json").read_text())
     assert written["doubtful"] is False and written["doubts"] == []
     assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
