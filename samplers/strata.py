@@ -36,10 +36,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtrc
 
 from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Stepping, Steps, offer_of
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
+    DISAGREEMENT_LEVEL,
     NOT_KNOWN,
     UNRESOLVED_SHARE,
     InputsOnly,
@@ -299,9 +301,12 @@ class _Sum:
         if found.status is Status.STOPPED:
             return replace(old, base_draws=drawn), n_old
         if found.interval[1] < old.interval[0]:
-            about = f"The larger of two runs found less ({found.p:.1e}): it has missed a region of failure."
+            about = f"The larger of two runs found less ({found.p:.1e} after {old.p:.1e}): it may have missed failures."
+            hits, draws = old.counts or (0, 0)
+            by_chance = hits > 0 and found.p > 0 and bdtrc(hits - 1, draws, found.interval[1]) > DISAGREEMENT_LEVEL
+            of, behind = (found, n) if by_chance else (old, n_old)
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
-            return replace(old, interval=ends, base_draws=drawn, warnings=(*old.warnings, about)), n_old
+            return replace(of, interval=ends, base_draws=drawn, warnings=(*of.warnings, about)), behind
         if found.p == 0 < old.p and found.counts is not None and not is_resolved(old):
             # plain draws say that what a search has not resolved is rare
             high = max(clopper_pearson(0, drawn, self.goal.confidence)[1], old.p)

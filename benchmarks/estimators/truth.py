@@ -124,7 +124,7 @@ def main(
     versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
     command = " ".join(["python -m benchmarks.estimators.truth", *sys.argv[1:]])
     found |= {"commands": sorted({*found.get("commands", ()), command}), "versions": versions}
-    groups = {"results": PLAIN, "strata": STRATA}
+    groups: dict[str, tuple[World, ...]] = {"results": PLAIN, "strata": STRATA}
     if ego != "idm":
         groups = {ego: tuple(world._replace(ego=ego, wide=1.0) for world in STRATA)}
     for group, worlds in groups.items():
