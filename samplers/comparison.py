@@ -64,7 +64,7 @@ class Comparison(Kept):
     Example:
         >>> import samplers
         >>> a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 3.2))
-        >>> comparison = samplers.compare(a, b, seed=0, max_sim=8000)
+        >>> comparison = samplers.compare(a, b, seed=1, max_sim=8000)
         >>> comparison.n_sim, comparison.interval[0] < 1.965 < comparison.interval[1]  # Phi(-3) / Phi(-3.2)
         (8000, True)
         >>> round(comparison.both / comparison.b.p, 2)  # B fails where A does
@@ -245,7 +245,7 @@ def compare(
         >>> import samplers
         >>> a = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> b = samplers.FunctionProblem(lambda x: 3.2 - x[:, 0], dim=2)
-        >>> print(f"{samplers.compare(a, b, seed=0, max_sim=8000).ratio:.1f}")  # Phi(-3) / Phi(-3.2) = 1.96
+        >>> print(f"{samplers.compare(a, b, seed=1, max_sim=8000).ratio:.1f}")  # Phi(-3) / Phi(-3.2) = 1.96
         2.0
     """
     if max_sim is not None:
