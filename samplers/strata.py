@@ -7,7 +7,8 @@ whose part of the rest is no larger than its pilot keeps the pilot; any other ha
 that of the new run alone, so that the pilot decides how large the run is and adds nothing to it. Only where the new run
 meets no failure and the pilot did, both count, by their simulations: so p is a little too high where failures are few.
 Counts of plain draws are pooled with those of the pilot, which makes p too low by about a tenth of its standard error
-(`benchmarks/samplers/strata.py`); plain draws after a search that resolved nothing are worth it however few they are.
+(`python -m benchmarks.samplers --set strata`); plain draws after a search that resolved nothing are worth it however
+few they are.
 
 With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in strata whose own c.o.v. is above
 t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum without a failure goes on, as far as

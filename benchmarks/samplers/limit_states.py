@@ -13,14 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import quad
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 from scipy.stats import chi2, ncx2
 
-from samplers.limit_states import Reference, integrate, normal_cdf, normal_mean
+from samplers import StratifiedProblem, Stratum
+from samplers.limit_states import half_space, integrate, normal_cdf, normal_mean
 from samplers.problem import FloatArray, FunctionProblem
 
 Seed = int | tuple[int, ...]
 PointFunction = Callable[[FloatArray], FloatArray]
+Watch = Callable[[PointFunction], PointFunction]
 Noise = Callable[[np.random.Generator, int], FloatArray]
 """What n evaluations add to f, shape (n,)."""
 
@@ -38,15 +40,43 @@ class LimitState:
     noise: Noise | None = None
     """Noise that every evaluation adds to f."""
 
-    def problem(self, rotation: Seed | None = None, noise_seed: int = 0) -> FunctionProblem:
+    def problem(self, rotation: Seed | None = None, noise_seed: int = 0, watch: Watch = lambda f: f) -> FunctionProblem:
         """Return the problem for a sampler.
 
         Args:
             rotation: Seed of a random rotation of the input space; None for no rotation.
             noise_seed: Seed of the noise: one for each run.
+            watch: What f is called through.
         """
         f = self.f if rotation is None else _rotated(self.f, random_rotation(self.dim, rotation))
-        return FunctionProblem(_noisy(f, self.noise, noise_seed) if self.noise else f, self.dim)
+        return FunctionProblem(watch(_noisy(f, self.noise, noise_seed) if self.noise else f), self.dim)
+
+
+@dataclass(frozen=True)
+class StrataState:
+    """Half-spaces in strata of very different size."""
+
+    shares: tuple[float, ...]
+    each: tuple[float, ...]
+    """Probabilities within the strata."""
+    dim: int = 3
+    """Of each stratum."""
+    standard_error: float = 0.0
+
+    @property
+    def p(self) -> float:
+        """The sum over the strata."""
+        return math.fsum(share * p for share, p in zip(self.shares, self.each, strict=True))
+
+    def problem(
+        self, rotation: Seed | None = None, noise_seed: int = 0, watch: Watch = lambda f: f
+    ) -> StratifiedProblem:
+        """Return the problem for a sampler; called as that of a `LimitState`, but without rotation and noise."""
+        strata = []
+        for k, (share, p) in enumerate(zip(self.shares, self.each, strict=True)):
+            f = half_space(self.dim, -float(ndtri(p))).problem.evaluate
+            strata.append(Stratum(f"stratum {k}", share, FunctionProblem(watch(f), self.dim)))
+        return StratifiedProblem(strata)
 
 
 @functools.lru_cache(maxsize=8)
@@ -55,11 +85,6 @@ def random_rotation(dim: int, seed: Seed) -> FloatArray:
     q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, dim)))
     rotation: FloatArray = q * np.sign(np.diag(r))
     return rotation
-
-
-def as_limit_state(reference: Reference) -> LimitState:
-    """Return a problem of `samplers.limit_states` as a limit state."""
-    return LimitState(reference.problem.evaluate, reference.problem.dim, reference.p)
 
 
 def half_spaces(dim: int, betas: Sequence[float], slopes: Sequence[float] = (), noise: float = 0.0) -> LimitState:

@@ -12,7 +12,7 @@ from benchmarks.samplers.fourth_states import FOURTH
 from benchmarks.samplers.limit_states import (
     LimitState,
     Seed,
-    as_limit_state,
+    StrataState,
     concave,
     corner,
     half_spaces,
@@ -33,7 +33,7 @@ from samplers.limit_states import Reference, four_branches, half_space, parabola
 class BenchmarkProblem:
     """A problem of the benchmark."""
 
-    make: Callable[[], LimitState]
+    make: Callable[[], LimitState | StrataState]
     group: str
     """The set that it is of: one of `GROUPS`, or a file."""
     rotation: Seed | None = None
@@ -42,8 +42,8 @@ class BenchmarkProblem:
     """False where no method can know of a region of failure: it then counts in no coverage."""
 
 
-def _reference_state(reference: Callable[..., Reference], *args: float) -> Callable[[], LimitState]:
-    return lambda: as_limit_state(reference(*args))
+def _reference_state(make: Callable[..., Reference], *args: float) -> Callable[[], LimitState]:
+    return lambda: LimitState((one := make(*args)).problem.evaluate, one.problem.dim, one.p)
 
 
 def _collide(env_id: str, base: str) -> LimitState:
@@ -60,6 +60,7 @@ def _collide(env_id: str, base: str) -> LimitState:
 
 _visible = partial(BenchmarkProblem, group="visible")
 _driving = partial(BenchmarkProblem, group="driving")
+_strata = partial(BenchmarkProblem, group="strata")
 PROBLEMS: dict[str, BenchmarkProblem] = {
     # one region
     "lin_d2": _visible(_reference_state(half_space, 2)),
@@ -99,6 +100,10 @@ PROBLEMS: dict[str, BenchmarkProblem] = {
     # dozens of regions or directions: no proposal is to be found
     "slabs_d20": BenchmarkProblem(partial(slabs, 20, 4.5), "directionless"),
     "squares_d50": BenchmarkProblem(partial(squares, 50, 1.0, 17.0), "directionless"),
+    # half-spaces in strata; 1.4e-4 is about the share of lane changes made without a look
+    "strata_common": _strata(partial(StrataState, (0.6, 0.3, 0.1), (1e-2, 5e-2, 0.2))),
+    "strata_looked": _strata(partial(StrataState, (0.98986, 0.01, 1.4e-4), (3e-5, 1e-3, 0.2))),
+    "strata_rare": _strata(partial(StrataState, (0.98986, 0.01, 1.4e-4), (1e-6, 1e-3, 0.2))),
     # for the time that methods take for themselves
     "lin_d6": BenchmarkProblem(_reference_state(half_space, 6), "speed"),
     "lin_d428": BenchmarkProblem(_reference_state(half_space, 428), "speed"),
@@ -138,7 +143,7 @@ def find_problem(name: str) -> BenchmarkProblem:
 
 
 @cache
-def limit_state(name: str) -> LimitState:
+def limit_state(name: str) -> LimitState | StrataState:
     """Return the limit state of a problem; its p is computed once."""
     return find_problem(name).make()
 

@@ -9,18 +9,20 @@ import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
 
+from benchmarks.samplers.limit_states import PointFunction
 from benchmarks.samplers.other_libraries import OTHER_SOLVERS, Solver
 from benchmarks.samplers.problems import find_problem, limit_state
-from samplers import METHODS, Estimate, FunctionProblem, Stepping, estimate
+from samplers import METHODS, Estimate, Stepping, estimate
 from samplers.problem import FloatArray
 
 _Job = TypeVar("_Job")
@@ -28,7 +30,7 @@ _Run = TypeVar("_Run")
 
 GUARD_FACTOR = 50
 """Times its budget that a method of somebody else may simulate before it is stopped."""
-GUARD_SECONDS = 15.0
+GUARD_SECONDS = 5.0
 """Processor time that it may take for a run, f included."""
 
 
@@ -76,20 +78,18 @@ class MethodRun:
 
 
 class Meter:
-    """Counts calls and points of f and the processor time spent in it.
+    """Counts calls and points of functions and the processor time spent in them.
 
     Args:
-        f: Maps points (n, d) to (n,).
         limit: Points after which the next call raises `LimitReached`, as it does after `GUARD_SECONDS`; None for no
             limits.
     """
 
-    def __init__(self, f: Callable[[FloatArray], FloatArray], limit: int | None = None) -> None:
-        self._start = time.process_time()
+    def __init__(self, limit: int | None = None) -> None:
         self.calls, self.points, self.seconds = 0, 0, 0.0
         self.reached: LimitReached | None = None
         """What was raised at the limit; libraries in C++ pass on less of it."""
-        self._f, self._limit = f, limit
+        self._limit, self._start = limit, time.process_time()
         self._digest = hashlib.blake2b(digest_size=8)
 
     @property
@@ -97,8 +97,11 @@ class Meter:
         """Digest of all points so far."""
         return self._digest.hexdigest()
 
-    def __call__(self, x: FloatArray) -> FloatArray:
-        """Call f."""
+    def watch(self, f: PointFunction) -> PointFunction:
+        """Return f, counted; it maps points (n, d) to (n,)."""
+        return partial(self._call, f)
+
+    def _call(self, f: PointFunction, x: FloatArray) -> FloatArray:
         start = time.process_time()
         if self._limit is not None:
             if self.points + len(x) > self._limit:
@@ -110,7 +113,7 @@ class Meter:
         self.calls += 1
         self.points += len(x)
         self._digest.update(np.ascontiguousarray(x).tobytes())
-        values = self._f(x)
+        values = f(x)
         self.seconds += time.process_time() - start
         return values
 
@@ -150,78 +153,62 @@ def find_method(name: str) -> Stepping | Solver:
     return found  # type: ignore[no-any-return]  # either, by now
 
 
-def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
-    """Make one run. What the method raises is recorded, so that a benchmark goes on.
-
-    Args:
-        job: The run; its method is found by name.
-        method: The method itself instead, of which the job has a name of your choice.
-    """
-    state = limit_state(job.problem)
-    rotation = find_problem(job.problem).rotation if job.rotation is None else job.rotation
-    method = find_method(job.method) if method is None else method
-    own = isinstance(method, Stepping)
-    limit = None if own or job.max_sim is None else GUARD_FACTOR * job.max_sim
-    meter = Meter(state.problem(rotation, noise_seed=job.seed).evaluate, limit)
-    problem = FunctionProblem(meter, state.dim)
+def run_once(job: Job) -> MethodRun:
+    """Make one run. What the method raises is recorded, so that a benchmark goes on."""
+    problem, method = find_problem(job.problem), find_method(job.method)
+    meter = Meter(None if isinstance(method, Stepping) or job.max_sim is None else GUARD_FACTOR * job.max_sim)
+    rotation = problem.rotation if job.rotation is None else job.rotation
+    watched: Any = limit_state(job.problem).problem(rotation, job.seed, meter.watch)
+    answer, error, start = Answer(math.nan, math.nan, math.nan, status="raised"), "", time.process_time()
     with use_one_core():
-        start = time.process_time()
         try:
-            if isinstance(method, Stepping):
-                answer: Any = estimate(problem, method, seed=job.seed, max_sim=job.max_sim)
-            else:
-                answer = method(problem, seed=job.seed, max_sim=job.max_sim)
-            return read_answer(job, meter, time.process_time() - start, answer)
-        except (Exception, SystemExit) as error:  # what a method does must not end a benchmark
-            run = _record(job, meter, time.process_time() - start, (math.nan,) * 4, "raised")
-            cause = meter.reached or error
-            return replace(run, error=f"{type(cause).__name__}: {cause}")
+            run: Any = partial(estimate, watched, method) if isinstance(method, Stepping) else partial(method, watched)
+            answer = read_answer(run(seed=job.seed, max_sim=job.max_sim))
+        except (Exception, SystemExit) as raised:  # what a method does must not end a benchmark
+            cause = meter.reached or raised
+            error = f"{type(cause).__name__}: {cause}"
+    return MethodRun(
+        method=job.method,
+        problem=job.problem,
+        seed=job.seed,
+        max_sim=job.max_sim,
+        **answer._asdict(),
+        n_sim=meter.points,
+        calls=meter.calls,
+        points=meter.digest,
+        seconds=time.process_time() - start - meter.seconds,
+        error=error,
+    )
 
 
-def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRun:
-    """Return the record of a run from what the method returned.
+class Answer(NamedTuple):
+    """What a method says."""
+
+    p: float
+    low: float
+    high: float
+    cov: float = math.nan
+    status: str = "ended"
+    warnings: tuple[str, ...] = ()
+    stated: int | None = None
+
+
+def read_answer(answer: Any) -> Answer:
+    """Return what a method said.
 
     Raises:
         TypeError: It is neither a result nor three or four numbers.
         ValueError: One of them is NaN.
     """
     if isinstance(answer, Estimate):
-        p, (low, high), cov, stated = answer.p, answer.interval, answer.cov, answer.n_sim
-        status, warnings = str(answer.status), answer.warnings
-    else:
-        if hasattr(answer, "interval"):
-            answer = (answer.p, *answer.interval, getattr(answer, "cov", math.nan))
-        numbers = [float(value) for value in answer]
-        if len(numbers) not in (3, 4):
-            raise TypeError(f"expected p, low, high and perhaps c.o.v., got {len(numbers)} numbers")
-        p, low, high, cov = (*numbers, math.nan)[:4]
-        stated, status, warnings = None, "ended", ()
-    if math.isnan(p) or math.isnan(low) or math.isnan(high):
-        raise ValueError(f"expected p and an interval, got {p:g} and {low:g} to {high:g}")
-    run = _record(job, meter, seconds, (p, low, high, cov), status)
-    return replace(run, warnings=tuple(warnings), stated=stated)
-
-
-def _record(
-    job: Job, meter: Meter, seconds: float, numbers: tuple[float, float, float, float], status: str
-) -> MethodRun:
-    """Return the record of a run with p, low, high and c.o.v., and what its meter counted."""
-    p, low, high, cov = numbers
-    return MethodRun(
-        method=job.method,
-        problem=job.problem,
-        seed=job.seed,
-        p=p,
-        low=low,
-        high=high,
-        cov=cov,
-        n_sim=meter.points,
-        calls=meter.calls,
-        seconds=seconds - meter.seconds,
-        status=status,
-        max_sim=job.max_sim,
-        points=meter.digest,
-    )
+        return Answer(answer.p, *answer.interval, answer.cov, str(answer.status), tuple(answer.warnings), answer.n_sim)
+    numbers = [float(value) for value in answer]
+    if len(numbers) not in (3, 4):
+        raise TypeError(f"expected p, low, high and perhaps c.o.v., got {len(numbers)} numbers")
+    if any(map(math.isnan, numbers[:3])):
+        raise ValueError(f"expected p and an interval, got {numbers[0]:g} and {numbers[1]:g} to {numbers[2]:g}")
+    p, low, high, cov = (*numbers, math.nan)[:4]
+    return Answer(p, low, high, cov)
 
 
 def map_jobs(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from benchmarks.samplers.limit_states import LimitState
+from benchmarks.samplers.limit_states import LimitState, StrataState
 from benchmarks.samplers.problems import find_problem, limit_state
 from benchmarks.samplers.runs import MethodRun
 from samplers.problem import FloatArray
@@ -127,7 +127,7 @@ def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
     ]
 
 
-def cell_of(runs: Sequence[MethodRun], state: LimitState, knowable: bool = True) -> Cell:
+def cell_of(runs: Sequence[MethodRun], state: LimitState | StrataState, knowable: bool = True) -> Cell:
     """Summarise the runs of one method on one problem; coverage is no fault where a region is not `knowable`."""
     p = state.p
     ended = [run for run in runs if not run.error]
