@@ -38,17 +38,14 @@ rare_envs/CutIn-v0, us101-15-offsets: p = 7.82e-04 by 300,000,000 rollouts
 rare_envs/CutIn-v0, highway: p = 3.07e-04 by 300,000,000 rollouts
 ```
 
-Two-stage and auto in traffic are by the present code; what other tables have of them was measured at commit 8dec38c6,
-before the method lost components.
-
 - *mean / p*: mean of the estimates over the seeds, relative to the exact or reference probability.
 - *coverage*: share of the runs whose 95 % interval covers p.
 - *c.o.v. (own)*: coefficient of variation over the seeds, and the one that the runs state.
 - *gain*: simulations that plain Monte Carlo needs for the same mean square error, over those of the method.
 """
 SHOWN_PAPERS = ("tian2024", "okelly2018_full", "okelly2018_vision")
-SHOWN_STATES = 28
-"""Limit states with the least gains that the page shows; the records have all."""
+SHOWN_STATES = 12
+"""Limit states with the least gains that the page shows; the record has all."""
 COMPARED = ("mean of p", "gain over plain Monte Carlo", "p (")
 """Quantities of a paper's tables that the page shows, by their beginnings."""
 
@@ -101,81 +98,28 @@ def format_traffic() -> Iterator[str]:
     )
 
 
-def format_known() -> Iterator[str]:
-    """Yield the section of limit states with known p, worst gain first."""
-    records = [read(f"two_stage_seeds_{name}") for name in ("third", "hard", "visible", "blind")]
-    yield "## Two-stage where p is known\n\n6,000 simulations, 60 seeds each, worst gain first. *low : high* counts"
-    yield "intervals wholly below and wholly above p; *error / own* is the root mean square of a run's error over the"
-    yield "standard error that it states (`python -m benchmarks.samplers --method two-stage --runs 60`).\n"
-    rows = sorted(
-        (row for record in records for row in record["rows"] if row["gain"] is not None),
-        key=lambda row: float(row["gain"]),
-    )
-    yield format_table(
-        ("problem", "p", "gain", "coverage", "low : high", "c.o.v. (own)", "error / own"),
-        (
-            (
-                row["problem"],
-                f"{row['p']:.2g}",
-                f"{row['gain']:,.3g}",
-                f"{row['coverage']:.0%}",
-                f"{row['low']} : {row['high']}",
-                _format_cov(row),
-                f"{row['error_over_own']:.2f}",
-            )
-            for row in rows[:SHOWN_STATES]
-        ),
-    )
-    others = rows[SHOWN_STATES:]
-    held = sum(row["coverage"] * row["runs"] for row in others) / sum(row["runs"] for row in others)
-    least = f"{others[0]['gain']:,.2g}"
-    yield f"\nThe other {len(others)} have gains of {least} and more; {held:.1%} of their intervals cover p."
-
-
-def format_few() -> Iterator[str]:
-    """Yield the section of small budgets."""
-    record = read("few_simulations")
-    yield "## The surrogate with 300 simulations\n"
-    rows = [row for row in record["rows"] if (row["method"], row["max_sim"]) == ("surrogate", 300) and row["runs"] >= 5]
-    yield format_table(
-        ("problem", "d", "p", "runs", "gain", "coverage", "c.o.v. (own)"),
-        (
-            (
-                row["problem"],
-                str(row["dim"]),
-                f"{row['p']:.1e}",
-                str(row["runs"]),
-                f"{row['gain']:,.3g}",
-                f"{row['coverage']:.0%}",
-                _format_cov(row),
-            )
-            for row in rows
-        ),
-    )
+def format_samplers() -> Iterator[str]:
+    """Yield the section of methods where p is known, side by side."""
+    record = read("samplers")
+    yield f"## Methods where p is known\n\n`{record['about']['command']}`. A run is *wrong* where it is off by more than"
+    yield "4 of its own standard errors or its interval misses p; shares with 95 % intervals (Clopper and Pearson).\n"
+    (tables,) = record["tables"]
+    yield format_table(*tables["methods"])
+    yield "\nGains (coverage in %) where the first covers or gains least, and where another gains **twice as much**:\n"
+    heads, rows = tables["problems"]
+    yield format_table(heads, (row for k, row in enumerate(rows) if k < SHOWN_STATES or "**" in "".join(row)))
 
 
 def format_strata() -> Iterator[str]:
     """Yield the section of sums over strata."""
     record = read("strata")
-    yield f"## Sums over strata\n\n`{record['command']}`: three strata with known p."
-    yield "Coverages of 0.93 are those of 0.95 by chance; *whole* is the error of plain Monte Carlo on the mixture.\n"
-    yield format_table(
-        ("shares", "p", "method", "simulations", "coverage", "low : high", "bias", "error (own)", "whole"),
-        (
-            (
-                "/".join(f"{share:.3g}" for share in case["shares"]),
-                "/".join(f"{p:g}" for p in case["p"]),
-                f"`{case['method']}`" + (f" x {case['replicates']}" if case["replicates"] > 1 else ""),
-                f"{case['n_sim']:,.0f}" + (f", c.o.v. {case['target_cov']:g}" if case["target_cov"] else ""),
-                f"{case['coverage']:.3f}",
-                f"{case['below']}:{case['above']}",
-                f"{case['bias']:+.3f}±{case['bias_error']:.3f}",
-                f"{case['error']:.3f} ({case['own']:.3f})",
-                f"{case['whole']:.2f}",
-            )
-            for case in record["cases"]
-        ),
-    )
+    yield f"## Sums over strata\n\n`{record['about']['command']}`: half-spaces in strata of very different size.\n"
+    for tables in record["tables"]:
+        yield f"{tables['budget']:,} simulations:\n"
+        yield format_table(*tables["methods"])
+        yield ""
+        yield format_table(*tables["problems"])
+        yield ""
 
 
 def _format_cov(row: Mapping[str, Any]) -> str:
@@ -285,8 +229,7 @@ def format_page() -> str:
 
     sections = (
         format_traffic(),
-        format_known(),
-        format_few(),
+        format_samplers(),
         format_strata(),
         format_bases(),
         format_egos(frozenset(rare_envs.ENV_IDS)),

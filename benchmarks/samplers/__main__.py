@@ -103,16 +103,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             jobs, partial(map_jobs, run_once, workers=options.workers), progress=True
         )
     cells = cells_of(runs)
+    tables = []
     for budget in options.budgets:
         groups = [[c for c in cells if (c.method, c.max_sim) == (method, budget)] for method in options.methods]
-        print("\n".join([f"## {budget:,} simulations, {options.runs} runs", "", *compare(groups), ""]))
-        if options.detail:
-            for group in groups:
-                print(f"### {group[0].method}, {budget:,} simulations\n\n{describe(group)}\n")
+        tables.append(compare(groups))
+        print("\n".join(describe(groups, tables[-1], options.detail)) + "\n")
     if options.out:
         words = sys.argv[1:] if arguments is None else arguments
         content = {
             "about": about(command=" ".join(["python -m benchmarks.samplers", *words])),
+            "tables": tables,
             "summaries": summaries_of(cells),
             "cells": [{**asdict(cell), "set": find_problem(cell.problem).group} for cell in cells],
         }
@@ -135,32 +135,38 @@ def _key_of(run: Job | MethodRun) -> tuple[str, str, int, int | None]:
     return run.method, run.problem, run.seed, run.max_sim
 
 
-def compare(groups: Sequence[Sequence[Cell]]) -> Iterator[str]:
-    """Yield the table of the methods, that of their gains side by side, and their faults.
+def compare(groups: Sequence[Sequence[Cell]]) -> dict[str, Any]:
+    """Return heads and rows of the table of the methods, and of that of their gains, the worst problem first.
 
     Args:
-        groups: The cells of each method, on the same problems in the same order.
+        groups: The cells of each method at one budget, on the same problems in the same order.
     """
+    ordered = sorted(zip(*groups, strict=True), key=lambda cells: _worst_first(cells[0]))
+    rows = [(cells[0].problem, f"{cells[0].dim}", f"{cells[0].p:.2g}", *_gains_of(cells)) for cells in ordered]
+    return {
+        "budget": groups[0][0].max_sim,
+        "methods": (HEADS, [_summary_row(summarise(group)) for group in groups]),
+        "problems": (("problem", "d", "p", *(group[0].method for group in groups)), rows),
+    }
+
+
+def describe(groups: Sequence[Sequence[Cell]], tables: dict[str, Any], detail: bool) -> Iterator[str]:
+    """Yield what is printed of a budget: the tables, the faults and, in `detail`, a table for each method."""
     first, runs = groups[0][0].method, groups[0][0].runs
-    yield format_table(HEADS, (_summary_row(summarise(group)) for group in groups))
+    yield f"## {tables['budget']:,} simulations, {runs} runs\n"
+    yield format_table(*tables["methods"])
     yield f"\nGain (coverage in %), **bold** beyond {BETTER:g} times {first}'s, {chance_of_bold(runs):.0%} by chance.\n"
-    rows = sorted(zip(*groups, strict=True), key=lambda cells: _worst_first(cells[0]))
-    yield format_table(
-        ("problem", "d", "p", *(group[0].method for group in groups)),
-        ((cells[0].problem, f"{cells[0].dim}", f"{cells[0].p:.2g}", *_gains_of(cells)) for cells in rows),
-    )
+    yield format_table(*tables["problems"])
     yield ""
     yield from (f"- {c.method}, {c.problem}: {'; '.join(c.faults)}" for group in groups for c in group if c.faults)
+    for group in groups if detail else ():
+        rows = (_detail_row(cell) for cell in sorted(group, key=_worst_first))
+        yield f"\n### {group[0].method}\n\n{format_table(DETAILS, rows)}"
 
 
 def chance_of_bold(runs: int) -> float:
     """Return how often one of two equal methods looks that much better, were errors Gaussian."""
     return float(stats.f.sf(BETTER, runs, runs))
-
-
-def describe(cells: Sequence[Cell]) -> str:
-    """Return the table of one method, the worst problem first."""
-    return format_table(DETAILS, (_detail_row(cell) for cell in sorted(cells, key=_worst_first)))
 
 
 def summaries_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
