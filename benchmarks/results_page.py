@@ -101,8 +101,8 @@ def format_traffic() -> Iterator[str]:
 def format_samplers() -> Iterator[str]:
     """Yield the section of methods where p is known, side by side."""
     record = read("samplers")
-    yield f"## Methods where p is known\n\n`{record['about']['command']}`. A run is *wrong* where it is off by more than"
-    yield "4 of its own standard errors or its interval misses p; shares with 95 % intervals (Clopper and Pearson).\n"
+    yield f"## Methods where p is known\n\n`{record['about']['command']}`. A run is *wrong* where it is off by more"
+    yield "than 4 of its own standard errors or its interval misses p; in brackets 95 % intervals (Clopper, Pearson).\n"
     (tables,) = record["tables"]
     yield format_table(*tables["methods"])
     yield "\nGains (coverage in %) where the first covers or gains least, and where another gains **twice as much**:\n"

@@ -153,20 +153,16 @@ def compare(groups: Sequence[Sequence[Cell]]) -> dict[str, Any]:
 def describe(groups: Sequence[Sequence[Cell]], tables: dict[str, Any], detail: bool) -> Iterator[str]:
     """Yield what is printed of a budget: the tables, the faults and, in `detail`, a table for each method."""
     first, runs = groups[0][0].method, groups[0][0].runs
+    chance = stats.f.sf(BETTER, runs, runs)  # that one of two equal methods looks so much better, with Gaussian errors
     yield f"## {tables['budget']:,} simulations, {runs} runs\n"
     yield format_table(*tables["methods"])
-    yield f"\nGain (coverage in %), **bold** beyond {BETTER:g} times {first}'s, {chance_of_bold(runs):.0%} by chance.\n"
+    yield f"\nGain (coverage in %), **bold** beyond {BETTER:g} times {first}'s, {chance:.0%} by chance.\n"
     yield format_table(*tables["problems"])
     yield ""
     yield from (f"- {c.method}, {c.problem}: {'; '.join(c.faults)}" for group in groups for c in group if c.faults)
     for group in groups if detail else ():
         rows = (_detail_row(cell) for cell in sorted(group, key=_worst_first))
         yield f"\n### {group[0].method}\n\n{format_table(DETAILS, rows)}"
-
-
-def chance_of_bold(runs: int) -> float:
-    """Return how often one of two equal methods looks that much better, were errors Gaussian."""
-    return float(stats.f.sf(BETTER, runs, runs))
 
 
 def summaries_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:

@@ -1,13 +1,11 @@
 """The problems of the sampler benchmark by name and by set."""
 
 import importlib.util
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
-from benchmarks import RESULTS
 from benchmarks.samplers.fourth_states import FOURTH
 from benchmarks.samplers.limit_states import (
     LimitState,
@@ -46,20 +44,7 @@ def _reference_state(make: Callable[..., Reference], *args: float) -> Callable[[
     return lambda: LimitState((one := make(*args)).problem.evaluate, one.problem.dim, one.p)
 
 
-def _collide(env_id: str, base: str) -> LimitState:
-    """Return a scenario with the IDM as ego, whose collisions were counted (`truth.json`), in N(0, I)."""
-    from rare_envs.problem import DrivingProblem  # the other problems need no torch
-
-    rows = json.loads((RESULTS / "truth.json").read_text(encoding="utf-8"))["results"]
-    (row,) = (row for row in rows if (row["env_id"], row["base"]) == (env_id, base))
-    problem = DrivingProblem(env_id, base=base)
-    return LimitState(
-        lambda u: problem.evaluate(problem.base.from_standard_normal(u)), problem.dim, row["p"], row["standard_error"]
-    )
-
-
 _visible = partial(BenchmarkProblem, group="visible")
-_driving = partial(BenchmarkProblem, group="driving")
 _strata = partial(BenchmarkProblem, group="strata")
 PROBLEMS: dict[str, BenchmarkProblem] = {
     # one region
@@ -93,10 +78,6 @@ PROBLEMS: dict[str, BenchmarkProblem] = {
     "noisy_d6": _visible(partial(half_spaces, 6, (3.5,), noise=0.3), rotation=11),
     **{name: _visible(make, rotation=seed and (20261122, seed)) for name, (make, seed) in VISIBLE.items()},
     **{name: BenchmarkProblem(make, "fourth", seed and (4, 1912, seed)) for name, (make, seed) in FOURTH.items()},
-    "following_us101_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "us101-gap")),
-    "following_highway_d3": _driving(partial(_collide, "rare_envs/CarFollowing-v0", "highway")),
-    "cut_in_us101_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "us101-15-offsets")),
-    "cut_in_highway_d6": _driving(partial(_collide, "rare_envs/CutIn-v0", "highway")),
     # dozens of regions or directions: no proposal is to be found
     "slabs_d20": BenchmarkProblem(partial(slabs, 20, 4.5), "directionless"),
     "squares_d50": BenchmarkProblem(partial(squares, 50, 1.0, 17.0), "directionless"),

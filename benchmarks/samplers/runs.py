@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
@@ -159,7 +159,8 @@ def run_once(job: Job) -> MethodRun:
     meter = Meter(None if isinstance(method, Stepping) or job.max_sim is None else GUARD_FACTOR * job.max_sim)
     rotation = problem.rotation if job.rotation is None else job.rotation
     watched: Any = limit_state(job.problem).problem(rotation, job.seed, meter.watch)
-    answer, error, start = Answer(math.nan, math.nan, math.nan, status="raised"), "", time.process_time()
+    answer: dict[str, Any] = {**dict.fromkeys(("p", "low", "high", "cov"), math.nan), "status": "raised"}
+    error, start = "", time.process_time()
     with use_one_core():
         try:
             run: Any = partial(estimate, watched, method) if isinstance(method, Stepping) else partial(method, watched)
@@ -172,7 +173,7 @@ def run_once(job: Job) -> MethodRun:
         problem=job.problem,
         seed=job.seed,
         max_sim=job.max_sim,
-        **answer._asdict(),
+        **answer,
         n_sim=meter.points,
         calls=meter.calls,
         points=meter.digest,
@@ -181,34 +182,22 @@ def run_once(job: Job) -> MethodRun:
     )
 
 
-class Answer(NamedTuple):
-    """What a method says."""
-
-    p: float
-    low: float
-    high: float
-    cov: float = math.nan
-    status: str = "ended"
-    warnings: tuple[str, ...] = ()
-    stated: int | None = None
-
-
-def read_answer(answer: Any) -> Answer:
-    """Return what a method said.
+def read_answer(answer: Any) -> dict[str, Any]:
+    """Return what a method said, as the fields of a `MethodRun`.
 
     Raises:
         TypeError: It is neither a result nor three or four numbers.
         ValueError: One of them is NaN.
     """
     if isinstance(answer, Estimate):
-        return Answer(answer.p, *answer.interval, answer.cov, str(answer.status), tuple(answer.warnings), answer.n_sim)
+        said = {"status": str(answer.status), "warnings": tuple(answer.warnings), "stated": answer.n_sim}
+        return {"p": answer.p, "low": answer.interval[0], "high": answer.interval[1], "cov": answer.cov, **said}
     numbers = [float(value) for value in answer]
     if len(numbers) not in (3, 4):
         raise TypeError(f"expected p, low, high and perhaps c.o.v., got {len(numbers)} numbers")
     if any(map(math.isnan, numbers[:3])):
         raise ValueError(f"expected p and an interval, got {numbers[0]:g} and {numbers[1]:g} to {numbers[2]:g}")
-    p, low, high, cov = (*numbers, math.nan)[:4]
-    return Answer(p, low, high, cov)
+    return {**dict(zip(("p", "low", "high", "cov"), (*numbers, math.nan), strict=False)), "status": "ended"}
 
 
 def map_jobs(

@@ -24,7 +24,6 @@ from benchmarks.samplers.limit_states import (
 from benchmarks.samplers.problems import PROBLEMS, find_problem, limit_state
 from benchmarks.samplers.runs import Job, find_method, map_jobs, run_once
 from benchmarks.samplers.summary import cell_of, cells_of
-from rare_envs import DrivingProblem
 
 WRONG = "tests.benchmarks.wrong_samplers"
 NEAR = {
@@ -77,16 +76,6 @@ def test_probabilities_against_draws_that_reach_the_failures(name):
     error = math.hypot(math.sqrt((squares - total**2) / (20 * n)), state.standard_error)
     assert error < 0.12 * state.p
     assert total == pytest.approx(state.p, abs=4 * error)
-
-
-def test_driving_states_are_the_scenarios_in_standard_normal_space():
-    state, problem = (
-        find_problem("cut_in_us101_d6").make(),
-        DrivingProblem("rare_envs/CutIn-v0", base="us101-15-offsets"),
-    )
-    u = np.random.default_rng(0).standard_normal((20, state.dim))
-    np.testing.assert_array_equal(state.f(u), problem.evaluate(problem.base.from_standard_normal(u)))
-    assert state.p == 234_665 / 3e8
 
 
 def test_a_function_of_a_third_party_is_counted_and_read():
