@@ -25,6 +25,7 @@ import argparse
 import importlib.util
 import json
 import math
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -109,9 +110,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tables.append(compare(groups))
         print("\n".join(describe(groups, tables[-1], options.detail)) + "\n")
     if options.out:
-        words = sys.argv[1:] if arguments is None else arguments
+        words = " ".join(["python -m benchmarks.samplers", *(sys.argv[1:] if arguments is None else arguments)])
         content = {
-            "about": about(command=" ".join(["python -m benchmarks.samplers", *words])),
+            "about": about(command=re.sub(r" --(keep|out) \S+", "", words)),
             "tables": tables,
             "summaries": summaries_of(cells),
             "cells": [{**asdict(cell), "set": find_problem(cell.problem).group} for cell in cells],
