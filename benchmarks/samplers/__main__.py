@@ -11,7 +11,7 @@ adds a table for each method.
 - gain: variance of plain Monte Carlo at as many simulations, over the mean square error;
 - coverage: runs whose 95 % interval holds p, with the interval that so many runs allow (Clopper and Pearson);
 - low : high: runs whose interval is wholly below p, the unsafe side, and wholly above;
-- wrong: off by more than 4 own standard errors, or the interval misses p; right: all others; how many of each warn;
+- far: off by more than 4 own standard errors; wrong: far, or the interval misses p; right: all others; how many warn;
 - mean / p: mean of the estimates over the known probability, with its standard error;
 - c.o.v.: spread of the estimates over their mean, and in brackets what the runs state;
 - error / own: root mean square of a run's error over the standard error that it states;
@@ -49,7 +49,10 @@ from samplers.output import to_json_value
 OURS = ("auto", "two-stage", "ice", "adss", "mc")
 BETTER = 2.0
 """Times the gain of the first method from which on another's is printed bold."""
-HEADS = ("method", "problems", "coverage", "low : high", "gain", "wrong: warned", "right: warned", "time [ms]")
+HEADS = (
+    *("method", "problems", "coverage", "low : high", "gain", "far: warned", "wrong: warned", "right: warned"),
+    "time [ms]",
+)
 DETAILS = (
     *("problem", "d", "p", "mean / p", "c.o.v. (own)", "error / own", "gain", "coverage", "low : high", "U / L"),
     *("right: warned", "simulations", "calls", "time [ms]"),
@@ -183,7 +186,7 @@ def _summary_row(row: Summary) -> Sequence[str]:
     gain = f"{row.gain:,.3g}" + (f" on {row.gains}" if row.gains < row.problems else "")
     return (
         *(row.method, f"{row.problems}", f"{row.covered}", f"{row.low} : {row.high}", gain),
-        *(f"{row.wrong_warned}", f"{row.right_warned}", f"{1e3 * row.seconds:,.0f}"),
+        *(f"{row.far_warned}", f"{row.wrong_warned}", f"{row.right_warned}", f"{1e3 * row.seconds:,.0f}"),
     )
 
 
