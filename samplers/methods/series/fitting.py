@@ -166,11 +166,8 @@ def build_laws(
     """Return bumps with shares (k,), the same nearer and wider, and Gaussians around points z (m, r), m > 0."""
     nearer, wider = LAW.nearer
     tempered = [replace(bump, mean=nearer * bump.mean, variance=wider * bump.variance) for bump in bumps]
-    own = np.argmax(log_ratios(bumps, points) + np.log(shares)[:, None], axis=0)
-    around = [  # in the shape of the nearest bump, but wider
-        replace(bump, mean=0.9 * bump.axes.T @ point, variance=np.minimum(3 * bump.variance, 1.0))
-        for bump, point in zip((bumps[k] for k in own), points, strict=True)
-    ]
+    unit = np.eye(points.shape[1])
+    around = [SubspaceGaussian(unit, 0.9 * point, np.ones(len(unit))) for point in points]
     even = np.full(len(points), 1 / len(points))
     groups = (bumps, shares), (tempered, shares), (around, even)
     return [LiftedComponent(GaussianMixture(components, weights), axes) for components, weights in groups]

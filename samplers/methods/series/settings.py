@@ -37,15 +37,15 @@ class LAW:
     kept_gradients = 48  # The last ones span the subspace: later ones are at likelier failures
     shares = (0.55, 0.3, 0.15)
     """Of the fitted Gaussians; of the same nearer to the origin and wider, which bound weights where a fit is too
-    narrow or too far out; and of Gaussians around single points, so that a mode of one draw stays in reach."""
+    narrow or too far out; and of N(0.9 z, I) around single points z: a mode of one draw stays in reach, weights in a
+    half-space are bounded. In the shape of the fitted ones these leave a heavy draw in one of ten series systems."""
     nearer = (0.75, 1.7)
     """Factors of mean and variance of the second: a mean times 0.85 has 1.1 times the E[w^2]; 0.7 has 0.9 times it, but
     a heavy draw in one of ten series systems of half-spaces."""
     points = 24  # Single points: half of them the heaviest draws at most, the others ends of walks
     most = 3  # Gaussians of a term at most
-    many_ess = (
-        160.0  # Weights are raised to a power until they are worth so many points, for covariances and shares ...
-    )
+    many_ess = 160.0
+    """Weights are raised to a power until they are worth so many points, for covariances and shares ..."""
     few_ess = 15.0
     """... and so many, of failures alone, for means. Points under the lowest level that is worth as many serve where
     failures are fewer, for these lie in the same slab. With 40 for the means E[w^2] is 1.04 to 1.06 times as large, and
