@@ -126,6 +126,33 @@ def _format_cov(row: Mapping[str, Any]) -> str:
     return f"{shown[0]} ({shown[1]})"
 
 
+def format_stopping() -> Iterator[str]:
+    """Yield the section of runs that stop on what they see."""
+    record = read("stopping")
+    yield f"## Runs to a target\n\n`{record['command']}`: coverage at the stop, and of the sequence"
+    yield "at all looks, without the share that a search may have missed. *Gate*: wrong passes at a limit just below p,"
+    yield "wrong failures just above, undecided at 0.8 p and 1.25 p (by the interval).\n"
+    yield format_table(
+        ("problem", "p", "method, c.o.v.", "interval", "sequence", "at all looks", "times as wide", "gate"),
+        (
+            (
+                case["name"],
+                f"{case['p']:.1e}",
+                f"`{case['method']}`, {case['target_cov']:g}",
+                *("–" if case[key] is None else f"{case[key]:.1%}" for key in ("interval", "sequence", "looks")),
+                f"{case['width']:.2f}",
+                " / ".join(f"{now:.0%} ({before:.0%})" for now, before in zip(*_read_gates(case), strict=True)),
+            )
+            for case in record["cases"]
+        ),
+    )
+
+
+def _read_gates(case: Mapping[str, Any]) -> tuple[list[float], list[float]]:
+    """Return what the gate said by the sequence, and by the interval."""
+    return list(case["gate"].values()), list(case["gate_by_interval"].values())
+
+
 def format_bases() -> Iterator[str]:
     """Yield the section of intervals from refits."""
     record = read("recipe_coverage")
@@ -229,6 +256,7 @@ def format_page() -> str:
         format_traffic(),
         format_samplers(),
         format_strata(),
+        format_stopping(),
         format_bases(),
         format_egos(frozenset(rare_envs.ENV_IDS)),
         format_papers(),
