@@ -102,7 +102,8 @@ class Auto(Method):
         left = budget - len(run.f)
         rest, method = replace(goal, max_sim=left), AdaptiveSubsetSimulation() if run.many else TwoStage()
         if isinstance(method, AdaptiveSubsetSimulation):
-            known = RootedPoints(run.u, run.f, np.arange(len(run.f))) if run.inputs is inputs else None
+            assert len(run.f) == run.n_base  # base draws, all of them
+            known = RootedPoints(run.u, run.f, np.arange(run.n_base)) if run.inputs is inputs else None
             steps = method.steps(inputs, rest, rng, known)
         else:
             steps = method.steps(inputs, rest, rng)

@@ -185,7 +185,7 @@ class SurrogateRun:
             kriging, mixture = yield from self._learn(kriging)
         except Interrupted:
             return self.estimate_early(Status.STOPPED)
-        if self.may_leave and not self.learned and self.budget - len(self.f) >= LEAST_LEFT:
+        if self.may_leave and not (self.learned or self.many) and self.budget - len(self.f) >= LEAST_LEFT:
             return None
         if not (self.f <= self.goal.gamma).any():
             about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."

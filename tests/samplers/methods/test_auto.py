@@ -62,10 +62,11 @@ def test_without_a_failure_the_answer_is_a_bound_the_nearest_approach_and_what_t
 
 
 @pytest.mark.slow
-def test_a_plane_in_100_dimensions_is_learned_from_300_simulations():
-    reference = half_space(100, 3.5)
-    result = samplers.estimate(reference.problem, seed=0, max_sim=300)
-    assert (result.method.name, result.n_sim) == ("surrogate", 300)
+@pytest.mark.parametrize(("dim", "max_sim"), [(100, 300), (30, 1000)])
+def test_a_plane_in_many_dimensions_is_learned(dim, max_sim):
+    reference = half_space(dim, 3.5)
+    result = samplers.estimate(reference.problem, seed=0, max_sim=max_sim)
+    assert (result.method.name, result.n_sim) == ("surrogate", max_sim)
     assert result.interval[0] < reference.p < result.interval[1] and result.cov < 0.6  # 300 base draws: 4
 
 
