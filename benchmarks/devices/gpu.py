@@ -19,9 +19,9 @@ import typer
 
 import rare_envs
 import samplers
+from benchmarks import seconds
 from benchmarks.samplers.runs import about
 from benchmarks.simulation.throughput import CAR_FOLLOWING, CUT_IN, HIGHWAY, ppo
-from benchmarks.simulation.timing import seconds
 from rare_envs.devices import find_device
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import use_one_thread

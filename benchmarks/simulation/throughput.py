@@ -22,9 +22,9 @@ from torch import Tensor
 
 import rare_envs
 import samplers
+from benchmarks import seconds
 from benchmarks.samplers.runs import about
 from benchmarks.simulation import highway_env_reference as reference
-from benchmarks.simulation.timing import seconds
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import use_one_thread
 
