@@ -82,7 +82,8 @@ def repeat(case: Case, runs: int) -> dict[str, Any]:
     start, options = time.process_time(), {"target_cov": case.target_cov, "confidence": CONFIDENCE}
     found = [samplers.estimate(case.problem, case.method, seed=seed, **options) for seed in range(runs)]  # type: ignore[arg-type]
     seconds, looks = time.process_time() - start, [find_looks(each, case.target_cov) for each in found]
-    known = [(each, each.interval, each.sequence) for each in found if each.sequence is not None]
+    known = [(each.interval, each.sequence or each.interval) for each in found]  # nothing fails: one look, at the end
+    wide = [math.log(s[1] / s[0]) / math.log(i[1] / i[0]) for i, s in known if i[0] > 0]
     sequence, interval = (
         np.mean([judge(one, case.p) for one in judged], axis=0)
         for judged in (found, [replace(each, sequence=None) for each in found])
@@ -93,10 +94,10 @@ def repeat(case: Case, runs: int) -> dict[str, Any]:
         "bias": float(np.mean([each.p for each in found])) / case.p - 1,
         "n_sim": float(np.mean([each.n_sim for each in found])),
         "n_looks": float(np.median([len(each) for each in looks])),
-        "interval": sum(low <= case.p <= high for _, (low, high), _ in known) / runs,
-        "sequence": sum(low <= case.p <= high for _, _, (low, high) in known) / runs,
+        "interval": sum(low <= case.p <= high for (low, high), _ in known) / runs,
+        "sequence": sum(low <= case.p <= high for _, (low, high) in known) / runs,
         "looks": None if not any(looks) else sum(all(a <= case.p <= b for a, b in each) for each in looks) / runs,
-        "width": float(np.median([math.log(s[1] / s[0]) / math.log(i[1] / i[0]) for _, i, s in known])),
+        "width": float(np.median(wide)),
         "gate": dict(zip(names, sequence.tolist(), strict=True)),
         "gate_by_interval": dict(zip(names, interval.tolist(), strict=True)),
         "seconds": seconds / runs,
@@ -108,10 +109,8 @@ def main(
     out: Annotated[Path, typer.Option(help="File for the result.")] = RESULTS / "stopping.json",
 ) -> None:
     """Print the coverages under stopping and write them to a file."""
-    rows = []
-    for case in list_cases():
-        rows.append(repeat(case, runs))
-        print(json.dumps(to_json_value(rows[-1])), flush=True)
+    rows = [repeat(case, runs) for case in list_cases()]
+    print(json.dumps(to_json_value(rows), indent=1))
     about = {"command": f"python -m benchmarks.samplers.stopping --runs {runs}", "cases": to_json_value(rows)}
     out.write_text(json.dumps(about, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
