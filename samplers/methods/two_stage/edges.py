@@ -90,7 +90,8 @@ class Pieces(NamedTuple):
     @property
     def axes(self) -> FloatArray:
         """Unit directions in which they rise, shape (k, d)."""
-        return self.slopes / np.maximum(np.linalg.norm(self.slopes, axis=1), np.finfo(np.float64).tiny)[:, None]
+        steepness = np.maximum(np.linalg.norm(self.slopes, axis=1), np.finfo(np.float64).tiny)
+        return np.asarray(self.slopes / steepness[:, None])
 
     def locate_boundary(self) -> bool:
         """Return whether they locate where failure begins."""
@@ -102,11 +103,12 @@ class Pieces(NamedTuple):
 
 
 def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float) -> list[HalfSpaceIntersection]:
-    """Return proposals for a failure region: N(0, I) beyond a hyperplane, and in a corner of several; [] without any.
+    """Return proposals for a region: N(0, I) beyond a hyperplane, in a corner, or beyond each plane of a series.
 
     Pieces of y = gamma - f are fitted to points u (n, d), f (n,) around failures (m, d): to all points, to those that
     fail and to those that do not, as f may jump where failure begins, or be the same in all of the region. A hyperplane
-    through all points needs an R^2 of `min_r2`; all other fits must locate where failure begins.
+    through all points needs an R^2 of `min_r2`; all other fits must locate where failure begins. Where f is rather the
+    least of linear functions, as in a first passage, each piece of -y has a half-space of its own.
     """
     usual = _find_usual(f)
     u, y = u[usual], gamma - f[usual]
@@ -123,6 +125,11 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
                 fits.append(found)
     kinds = [fit for fit in fits if len(fit.errors) == 1], [fit for fit in fits if len(fit.errors) > 1]
     best = [max(kind, key=lambda fit: fit.explained) for kind in kinds if kind]
+    sample = None if any(fit.are_whole() for fit in fits) else _scale(u, -y)
+    series = None if sample is None else _fit_corner(sample)
+    if series is not None and series.locate_boundary():
+        each = zip(-series.slopes[:, None], -series.intercepts[:, None], series.errors[:, None], strict=True)
+        best += [Pieces(*piece, series.r2, series.share, beside=False) for piece in each]
     return [proposal for fit in best if (proposal := _beyond(fit, failures)) is not None]
 
 
@@ -223,14 +230,16 @@ def _fit_corner(sample: Sample) -> Pieces | None:
 
 def _refine(sample: Sample, own: NDArray[np.int64], sigmas: float) -> Regression | None:
     """Return regressions, each on the points (n,) at which it is the least piece, repeated until none moves."""
+    found = None
     for _ in range(STEPS):
-        found = _regress(sample, own)
-        if found is None:
+        regression = _regress(sample, own)
+        if regression is None:
             return None
-        before, own = own, _assign(sample, found.coefficients, sigmas)
-        if np.array_equal(own, before):
+        found = regression._replace(own=_assign(sample, regression.coefficients, sigmas))
+        if np.array_equal(own, found.own):
             break
-    return found._replace(own=own)
+        own = found.own
+    return found
 
 
 def _assign(sample: Sample, coefficients: FloatArray, sigmas: float) -> NDArray[np.int64]:
@@ -242,7 +251,7 @@ def _assign(sample: Sample, coefficients: FloatArray, sigmas: float) -> NDArray[
     predicted = sample.x @ coefficients.T
     own = predicted.argmin(axis=1)
     if math.isinf(sigmas):
-        return own
+        return np.asarray(own)
     deviation = np.abs(sample.y - predicted[np.arange(len(own)), own])
     limit = np.zeros(len(coefficients))
     for k in range(len(limit)):
@@ -261,7 +270,7 @@ def _regress(sample: Sample, own: NDArray[np.int64]) -> Regression | None:
         return None
     x = np.where(members[enough, :, None], sample.x, 0.0).transpose(0, 2, 1)
     normal = x @ sample.x + RIDGE * np.diag(np.arange(width) < width - 1)  # the intercept has no penalty
-    return Regression(np.linalg.solve(normal, (x @ sample.y)[:, :, None])[:, :, 0], own)
+    return Regression(np.asarray(np.linalg.solve(normal, (x @ sample.y)[:, :, None])[:, :, 0], np.float64), own)
 
 
 def _judge(sample: Sample, found: Regression | None) -> Pieces | None:
@@ -288,7 +297,7 @@ def _prune(sample: Sample, coefficients: FloatArray) -> FloatArray:
 
     def score(kept: NDArray[np.int64]) -> float:
         square = float(((sample.y - predicted[:, kept].min(axis=1)) ** 2).mean())
-        return n * math.log(max(square, LEAST_SQUARE)) + len(kept) * cost
+        return float(n * math.log(max(square, LEAST_SQUARE)) + len(kept) * cost)
 
     kept = np.arange(len(coefficients))
     while len(kept) > 1:
