@@ -6,23 +6,9 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
+from benchmarks.samplers import limit_states as kinds
 from benchmarks.samplers.fourth_states import FOURTH
-from benchmarks.samplers.limit_states import (
-    LimitState,
-    Seed,
-    StrataState,
-    concave,
-    corner,
-    half_spaces,
-    hidden_box,
-    islands,
-    never,
-    opposite,
-    ring_part,
-    slabs,
-    squares,
-    strip,
-)
+from benchmarks.samplers.limit_states import LimitState, Seed, StrataState
 from benchmarks.samplers.visible_states import VISIBLE
 from samplers.limit_states import Reference, four_branches, half_space, parabola, plateau, shell
 
@@ -53,34 +39,36 @@ PROBLEMS: dict[str, BenchmarkProblem] = {
     "lin_d500": _visible(_reference_state(half_space, 500)),
     "convex_d2": _visible(_reference_state(parabola), rotation=5),
     "sphere_d20": _visible(_reference_state(shell, 20, 1e-4)),
-    "island_d3": _visible(partial(islands, [(2.5, 2.0, 0.0)], [0.35])),
-    "corner_d5": _visible(partial(corner, 5, (1.6, 1.5, 1.2))),
-    "ringpart_d10": _visible(ring_part),
-    "strip_d4": _visible(strip),
+    "island_d3": _visible(partial(kinds.islands, [(2.5, 2.0, 0.0)], [0.35])),
+    "corner_d5": _visible(partial(kinds.corner, 5, (1.6, 1.5, 1.2))),
+    "ringpart_d10": _visible(kinds.ring_part),
+    "strip_d4": _visible(kinds.strip),
     "plateau_d3": _visible(_reference_state(plateau)),
     # several regions
-    "concave_d2": _visible(concave),
+    "concave_d2": _visible(kinds.concave),
     "branch4_d2": _visible(_reference_state(four_branches)),
-    "islands_d3": _visible(partial(islands, [(2.4, 1.8, 0.0), (-2.2, 0.0, -2.2)], [0.4, 0.5])),
-    "common_d4": _visible(partial(half_spaces, 4, (2.0, 2.1))),
-    "rare_d6": _visible(partial(half_spaces, 6, (5.0, 5.2)), rotation=9),
-    "six_d8": _visible(partial(half_spaces, 8, (3.5, 3.6, 3.6, 3.7, 3.8, 3.9), (1, 3, 0.4, 1, 0.3, 2)), rotation=4),
-    "two_d10": _visible(partial(opposite, 10, 3.5, 4.0)),
-    "two_d30": _visible(partial(half_spaces, 30, (3.4, 3.8)), rotation=1),
-    "two_d60": _visible(partial(half_spaces, 60, (3.4, 3.6)), rotation=2),
-    "four_d100": _visible(partial(half_spaces, 100, (3.5, 3.6, 3.7, 3.8)), rotation=3),
+    "islands_d3": _visible(partial(kinds.islands, [(2.4, 1.8, 0.0), (-2.2, 0.0, -2.2)], [0.4, 0.5])),
+    "common_d4": _visible(partial(kinds.half_spaces, 4, (2.0, 2.1))),
+    "rare_d6": _visible(partial(kinds.half_spaces, 6, (5.0, 5.2)), rotation=9),
+    "six_d8": _visible(
+        partial(kinds.half_spaces, 8, (3.5, 3.6, 3.6, 3.7, 3.8, 3.9), (1, 3, 0.4, 1, 0.3, 2)), rotation=4
+    ),
+    "two_d10": _visible(partial(kinds.opposite, 10, 3.5, 4.0)),
+    "two_d30": _visible(partial(kinds.half_spaces, 30, (3.4, 3.8)), rotation=1),
+    "two_d60": _visible(partial(kinds.half_spaces, 60, (3.4, 3.6)), rotation=2),
+    "four_d100": _visible(partial(kinds.half_spaces, 100, (3.5, 3.6, 3.7, 3.8)), rotation=3),
     # f leads away from the likelier region, or says nothing of it
-    "deceptive_d2": _visible(partial(opposite, 2, 5.0, 3.5, (0.5, 10.0))),
-    "decep_d8": _visible(partial(half_spaces, 8, (4.9, 3.5), (0.5, 10.0)), rotation=4),
-    "decep_box_d3": _visible(hidden_box, knowable=False),
-    "never_d4": _visible(never),
+    "deceptive_d2": _visible(partial(kinds.opposite, 2, 5.0, 3.5, (0.5, 10.0))),
+    "decep_d8": _visible(partial(kinds.half_spaces, 8, (4.9, 3.5), (0.5, 10.0)), rotation=4),
+    "decep_box_d3": _visible(kinds.hidden_box, knowable=False),
+    "never_d4": _visible(kinds.never),
     # every evaluation adds fresh noise; no proposal in u can gain more than 413
-    "noisy_d6": _visible(partial(half_spaces, 6, (3.5,), noise=0.3), rotation=11),
+    "noisy_d6": _visible(partial(kinds.half_spaces, 6, (3.5,), noise=0.3), rotation=11),
     **{name: _visible(make, rotation=seed and (20261122, seed)) for name, (make, seed) in VISIBLE.items()},
     **{name: BenchmarkProblem(make, "fourth", seed and (4, 1912, seed)) for name, (make, seed) in FOURTH.items()},
     # dozens of regions or directions: no proposal is to be found
-    "slabs_d20": BenchmarkProblem(partial(slabs, 20, 4.5), "directionless"),
-    "squares_d50": BenchmarkProblem(partial(squares, 50, 1.0, 17.0), "directionless"),
+    "slabs_d20": BenchmarkProblem(partial(kinds.slabs, 20, 4.5), "directionless"),
+    "squares_d50": BenchmarkProblem(partial(kinds.squares, 50, 1.0, 17.0), "directionless"),
     # half-spaces in strata; 1.4e-4 is about the share of lane changes made without a look
     "strata_common": _strata(partial(StrataState, (0.6, 0.3, 0.1), (1e-2, 5e-2, 0.2))),
     "strata_looked": _strata(partial(StrataState, (0.98986, 0.01, 1.4e-4), (3e-5, 1e-3, 0.2))),
