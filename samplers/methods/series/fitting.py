@@ -26,7 +26,7 @@ from samplers.components import (
 )
 from samplers.distributions import Gaussian
 from samplers.methods.base import SimulationSteps
-from samplers.methods.series.settings import LAW, ROUNDS, WALKS
+from samplers.methods.series import LAW, ROUNDS, WALKS
 from samplers.methods.series.walks import TermSimulator, Walks, join_terms
 from samplers.problem import FloatArray, Terms
 from samplers.proposals import correct_eigenvalues, fit_proposal_mixture, fit_shrunk_gaussian

@@ -14,8 +14,8 @@ from samplers.importance import Draws, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, offer_of, request_terms
 from samplers.methods.base import Method, RunContext, SimulationSteps
 from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.series import ROUNDS, WALKS
 from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
-from samplers.methods.series.settings import ROUNDS, WALKS
 from samplers.methods.series.walks import TermSimulator, plan_walks, walk_downhill
 from samplers.methods.subset import spend_on_subset_simulation
 from samplers.problem import FloatArray, Inputs, check_settings

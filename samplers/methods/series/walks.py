@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from samplers.method import Goal, TermsOffer, request_gradients, request_terms, whole_simulations
 from samplers.methods.base import SimulationSteps, Simulator, noise_mask
-from samplers.methods.series.settings import WALKS
+from samplers.methods.series import WALKS
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, Terms
 
 
