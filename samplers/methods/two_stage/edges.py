@@ -123,6 +123,9 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
             loosely = fit is _fit_plane and len(rows) == len(y)
             if found and (found.locate_boundary() or (loosely and found.explained > PLANES.min_r2)):
                 fits.append(found)
+    few = _fit_few(u, y) if len(y) <= u.shape[1] + MIN_POINTS else None
+    if few is not None and few.explained > PLANES.min_r2:
+        fits.append(few)
     kinds = [fit for fit in fits if len(fit.errors) == 1], [fit for fit in fits if len(fit.errors) > 1]
     best = [max(kind, key=lambda fit: fit.explained) for kind in kinds if kind]
     sample = None if any(fit.are_whole() for fit in fits) else _scale(u, -y)
@@ -131,6 +134,25 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
         each = zip(-series.slopes[:, None], -series.intercepts[:, None], series.errors[:, None], strict=True)
         best += [Pieces(*piece, series.r2, series.share, beside=False) for piece in each]
     return [proposal for fit in best if (proposal := _beyond(fit, failures)) is not None]
+
+
+def _fit_few(u: FloatArray, y: FloatArray) -> Pieces | None:
+    """Return the ridge regression of y (n,) on points u (n, d) that are too few for a slope in every direction.
+
+    With K = UU' + I of centred points the slope is U'K^-1 y, and y_i less its prediction by the others is
+    (K^-1 y)_i / (K^-1)_ii (Allen, "The relationship between variable selection and data augmentation and a method for
+    prediction", Technometrics 16, 1974).
+    """
+    middle, mean = u.mean(axis=0), float(y.mean())
+    total = float(((y - mean) ** 2).sum())
+    if not 0 < total < math.inf:
+        return None
+    inverse = np.linalg.inv((u - middle) @ (u - middle).T + np.eye(len(y)))
+    dual = inverse @ (y - mean)
+    slope, left_out = (u - middle).T @ dual, float(((dual / np.diag(inverse)) ** 2).sum())
+    error = np.array([math.sqrt(left_out / len(y))])
+    intercept = np.array([mean - slope @ middle])
+    return Pieces(slope[None], intercept, error, r2=1 - left_out / total, share=1.0, beside=False)
 
 
 def failure_edge(along: FloatArray) -> float:

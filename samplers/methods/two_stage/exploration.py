@@ -343,7 +343,17 @@ def find_regions(
         return ExplorationResult([], noisy=False, discovery=discovery)
     starts = yield from contract(simulator, starts, gamma, rng)
     result = yield from grow_regions(simulator, starts, gamma, sizes.limit, rng)
+    if len(result.regions) == 1 and not result.noisy:
+        result = result._replace(regions=[_add_levels(result.regions[0], descent)])
     return result._replace(levels=descent.levels, discovery=discovery)
+
+
+def _add_levels(region: Region, descent: SubsetPoints) -> Region:
+    """Return a region with the lower points of subset simulation, if its own are too few for a regression."""
+    if len(region.f) >= 3 * region.u.shape[1] or len(descent.f) == 0:
+        return region
+    low = descent.f <= np.quantile(descent.f, 0.7, method="lower")  # f may be infinite
+    return Region(region.chains, np.concatenate([region.u, descent.u[low]]), np.concatenate([region.f, descent.f[low]]))
 
 
 def _find_lines(
