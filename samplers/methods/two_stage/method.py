@@ -304,8 +304,10 @@ def _gives_up(
     last, early = state.rounds[-1], FALLBACK.early_rates
     late = FALLBACK.late_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
     rate = early[number - 1] if number <= len(early) else late
+    # One heavy draw leaves a round few effective failures; all rounds together may have many.
+    worth = max(last.ess, effective_sample_size(state.history.log_weights))
     # Draws within the span of slopes leave few places out: the weights met are about as uneven as all of them.
-    if last.ess < (0.25 if refinement.within is not None else 1.0) * rate * last.n:
+    if worth < (0.25 if refinement.within is not None else 1.0) * rate * last.n:
         return True
     # Ends of lines in a ring are no typical failures.
     described = refinement.exploration.noisy or refinement.within is not None
