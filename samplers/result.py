@@ -238,9 +238,11 @@ class Estimate(EstimateData, Kept):
         """What is not in p and its interval: what the problem holds fixed, and regions of failure that no draw met."""
         fixed = f"given that {self.given}; " if self.given else ""
         by = f"({self.base_draws:,} base draws, {100 * self.confidence:g} % confidence)"
+        text = f"{fixed}a failure region that no draw met: below {self.unseen:.1e} {by}"
         wide = sum(n for _, n in self.wide_draws)
-        corner = f"; a corner of three planes: below {self.unseen_corner:.0e} ({wide:,} wide draws)" if wide else ""
-        return f"{fixed}a failure region that no draw met: below {self.unseen:.1e} {by}{corner}"
+        if not wide:
+            return text
+        return f"{text}; a corner of planes at right angles: below {self.unseen_corner:.0e} ({wide:,} wide draws)"
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.

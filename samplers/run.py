@@ -47,7 +47,6 @@ from samplers.sample import (
     Interval,
     SimulatedPoints,
     Status,
-    add_unseen,
     clopper_pearson,
     confidence_sequence,
     gain_over_monte_carlo,
@@ -443,11 +442,7 @@ class Run:
         target = self._goal.target_cov or getattr(self._named, "own_target", None)
         if target is None or not (0 < whole.p < 1 and 0 < whole.cov < math.inf):
             return None
-        low, high = confidence_sequence(whole.p, whole.cov, target, self._goal.confidence)
-        lineages = math.inf if whole.sample is None else whole.sample.lineages
-        high = add_unseen(whole.p, high, lineages, self._goal.confidence)
-        known = 1 - whole.no_outcome_share if self._on_error == "bound" else 1.0
-        return min(known * low, interval[0]), max(high, interval[1])
+        return confidence_sequence(whole.p, interval, whole.cov, target, self._goal.confidence)
 
     def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""

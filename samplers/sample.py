@@ -368,9 +368,9 @@ FURTHEST = 1e4
 """Distance in standard deviations that no wide draw comes near."""
 
 
-def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf, fold: float = 1.0) -> Interval:
-    """Return p exp(-+ q s), p > 0, s^2 = log(1 + cov^2), q `fold` times the normal or t quantile; at most 1."""
-    quantile = fold * float(stdtrit(df, 0.5 + confidence / 2))
+def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
+    """Return p exp(-+ q s), p > 0, s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile; at most 1."""
+    quantile = float(stdtrit(df, 0.5 + confidence / 2))
     half = min(quantile * math.sqrt(math.log1p(cov * cov)), 700.0)  # exp(709) is the largest number
     return p * math.exp(-half), min(1.0, p * math.exp(half))
 
@@ -390,24 +390,26 @@ def corner_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> floa
     return float(ndtr(-brentq(excess, 0.0, FURTHEST))) ** CORNER if excess(0.0) < 0 < excess(FURTHEST) else 1.0
 
 
-def confidence_sequence(p: float, cov: float, target_cov: float, confidence: float) -> Interval:
+def confidence_sequence(p: float, interval: Interval, cov: float, target_cov: float, confidence: float) -> Interval:
     """Return ends of p, 0 < p < 1, that hold it at all looks together, whatever stops the run; asymptotic.
 
     The mean of n draws is at all n, with probability 1 - alpha, within
 
         sigma sqrt(2 (n rho^2 + 1) / (n^2 rho^2) log(sqrt(n rho^2 + 1) / alpha)),    rho fixed beforehand,
 
-    which is sigma / sqrt(n) times a factor of v = n rho^2. Here sigma / sqrt(n) is the c.o.v., the distance one from
+    which is sigma / sqrt(n) times a factor of v = n rho^2. Here sigma / sqrt(n) is the c.o.v., distances are those from
     log p (from p itself, upper ends of skew weights are too low), and n counts effective failures, 1 / cov^2: at
     v = v0 (target_cov / cov)^2 the factor is least at the target, 1.55 times the normal quantile at 95 %, with
-    v0 = a + log(a) + 1, a = -2 log(alpha). The first failures need no other rule: at one the factor is above 10, for a
-    target of 0.1, and quantiles are Student's. Each end alone holds with probability 1 - alpha / 2.
+    v0 = a + log(a) + 1, a = -2 log(alpha). The distances of the interval's own ends, whatever they allow for, are
+    multiplied by the factor over that quantile. The first failures need no other rule: at one the factor is above 10,
+    for a target of 0.1.
     """
     alpha = 1 - confidence
     a = -2 * math.log(alpha)
     v = (a + math.log(a) + 1) * (target_cov / cov) ** 2
     factor = math.sqrt(2 * (1 + 1 / v) * math.log(math.sqrt(v + 1) / alpha)) / float(ndtri(0.5 + confidence / 2))
-    return log_normal_interval(p, cov, confidence, degrees_of_freedom(cov**-2, independent=True), factor)
+    low, high = (p * (end / p) ** factor for end in interval)
+    return low, min(1.0, high)
 
 
 def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -> float:

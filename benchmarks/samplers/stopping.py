@@ -24,7 +24,7 @@ from samplers.limit_states import four_branches, half_space, parabola, plateau, 
 from samplers.method import Stepping
 from samplers.output import to_json_value
 from samplers.problem import Problem
-from samplers.sample import Interval, confidence_sequence
+from samplers.sample import Interval, confidence_sequence, log_normal_interval
 
 CONFIDENCE, BESIDE, NEAR = 0.95, 1e-3, 0.8
 
@@ -65,7 +65,8 @@ def find_looks(result: samplers.Estimate, target_cov: float) -> list[Interval]:
     first, spent, looks = result.draw_weights[-1].first, 0, []
     for level in () if result.parts else result.trace:
         if spent >= first and level.estimate > 0:
-            looks.append(confidence_sequence(level.estimate, level.cov, target_cov, CONFIDENCE))
+            ends = log_normal_interval(level.estimate, level.cov, CONFIDENCE)
+            looks.append(confidence_sequence(level.estimate, ends, level.cov, target_cov, CONFIDENCE))
         spent += level.n_sim
     return looks
 

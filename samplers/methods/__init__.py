@@ -46,7 +46,7 @@ class Auto(Method):
        - In up to 20 dimensions it ends so, unless 600 simulations are left when 200 were spent and the failures of two
          batches were never foreseen (f jumps, or fails in many regions): `TwoStage` has the rest.
        - In more it ends so where kriging explains 40 % of the variance of f from 100 base draws (a third of the run, if
-         that is less), each predicted from the others. Else `AdaptiveSubsetSimulation` goes on from these.
+         that is less), each that is safe predicted from the others. Else `AdaptiveSubsetSimulation` goes on from these.
 
        More simulations are for `TwoStage`.
     3. *Cost.* Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, 1,000;
@@ -54,9 +54,9 @@ class Auto(Method):
 
     The budget is that of one replicate; coordinates that the base distribution calls noise are not searched, and do not
     count as dimensions. What decided between methods does not count in p, but for the draws from which subset
-    simulation goes on: how well they are predicted decided, not how many fail. The result names the method, and
-    `Estimate.choice` says why. In a sum over strata every run of a stratum chooses for itself, after a pilot of plain
-    draws; `Part.method` names all.
+    simulation goes on: the safe ones decided, not how many fail. The result names the method, and `Estimate.choice`
+    says why. In a sum over strata every run of a stratum chooses for itself, after a pilot of plain draws;
+    `Part.method` names all.
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.

@@ -179,9 +179,11 @@ class SurrogateRun:
             if (self.f[: self.n_base] <= self.goal.gamma).mean() >= 0.1:  # plain Monte Carlo is as good
                 return (yield from self.draw_base())
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, None)
-            self.skill = kriging.skill
-            if self.may_leave and self.many and self.skill < LEAST_SKILL:
-                return None
+            if self.many and self.may_leave:  # whether draws fail does not decide: another method may count them in p
+                safe = self.f > self.goal.gamma
+                self.skill = fit_kriging(self.u[safe], self.f[safe] - self.goal.gamma, None).skill
+                if self.skill < LEAST_SKILL:
+                    return None
             kriging, mixture = yield from self._learn(kriging)
         except Interrupted:
             return self.estimate_early(Status.STOPPED)
@@ -265,6 +267,7 @@ class SurrogateRun:
         goal, cov, status = self.goal, math.inf, Status.CONVERGED
         draws = Draws(0, np.empty(0), np.empty(0))
         of_base = self.f[: self.n_base]  # outcomes of base draws
+        foreseen = spread = hits = 0.0  # failures of the final draws: predicted, their variance, met
         left = count_final_draws(goal, len(self.f), self.budget - len(self.f))
         pool, mixture = self._draw_pool(kriging, mixture)
         size = min(1000, math.ceil(left / 2)) if goal.target_cov is None else max(self.budget // 10, 1)
@@ -277,7 +280,9 @@ class SurrogateRun:
             except Interrupted:
                 status = Status.STOPPED
                 break
-            fails = f <= goal.gamma
+            fails, predicted = f <= goal.gamma, np.exp(pool.prediction.log_fail[rows])
+            foreseen, hits = foreseen + float(predicted.sum()), hits + int(fails.sum())
+            spread += float((predicted * (1 - predicted)).sum())
             draws = draws.join(Draws.from_outcomes(f, log_weights, x, goal.gamma))
             of_base = np.concatenate([of_base, f[from_base]])
             may_fail = effective_sample_size(pool.log_weights + pool.prediction.log_fail)
@@ -308,7 +313,7 @@ class SurrogateRun:
             interval=(low, min(high, 1.0)),
             cov=cov,
             status=Status.NO_HITS if status is Status.CONVERGED and none else status,
-            warnings=outcome.warnings if none else (),
+            warnings=outcome.warnings if none else _contradict(foreseen, spread, int(hits)),
             remarks=() if none else outcome.warnings,  # few draws are the rule here, and the interval says it
             sample=replace(draws.sample, lineages=lineages),
         )
@@ -322,6 +327,15 @@ class SurrogateRun:
         sample = Sample.of_equal_draws(f, self.inputs.base.from_standard_normal(self.u[:n][fails]))
         weights = (DrawWeights.of_equal_draws(n, 0, n),)
         return replace(outcome, counts=None, status=status, sample=sample, draw_weights=weights)
+
+
+def _contradict(foreseen: float, variance: float, hits: int) -> tuple[str, ...]:
+    """Return a warning where the failures among the final draws are not as many as kriging said, by 4 deviations."""
+    if abs(hits - foreseen) <= 4 * math.sqrt(variance + 1):
+        return ()
+    return (
+        f"Kriging foresaw {foreseen:.0f} failures among the final draws, and {hits} failed: it does not describe f.",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

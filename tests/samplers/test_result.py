@@ -63,7 +63,8 @@ def test_wide_draws_bound_a_corner_that_was_missed():
     b = -stats.norm.ppf(estimate.unseen_corner ** (1 / 3))
     missed = [(1 - stats.norm.cdf(-b / s) ** 3) ** n for s, n in ((1, 600), (2, 200), (3, 100))]
     assert np.prod(missed) == pytest.approx(0.05)
-    assert estimate.proviso.endswith(f"; a corner of three planes: below {estimate.unseen_corner:.0e} (300 wide draws)")
+    corner = f"; a corner of planes at right angles: below {estimate.unseen_corner:.0e} (300 wide draws)"
+    assert estimate.proviso.endswith(corner)
     assert estimate.to_dict()["unseen_corner"] == estimate.unseen_corner < 1e-2 * estimate.unseen
     assert replace(estimate, wide_draws=((2.0, 3),), base_draws=0).unseen_corner == 1
 

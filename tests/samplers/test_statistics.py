@@ -11,6 +11,7 @@ from samplers.sample import (
     clopper_pearson,
     confidence_sequence,
     effective_sample_size,
+    log_normal_interval,
     next_level,
     normalise_weights,
 )
@@ -72,12 +73,16 @@ def test_a_confidence_sequence_holds_at_all_looks_together():
     rng, runs = np.random.default_rng(0), 200
     hits = rng.poisson(5.0, (runs, 60)).cumsum(axis=1)
     estimates, covs = hits / (5.0 * np.arange(1, 61)), 1 / np.sqrt(np.maximum(hits, 0.5))
-    ends = np.vectorize(confidence_sequence)(np.maximum(estimates, 1e-9) / 100, covs, 0.1, 0.95)
+
+    def find_ends(p, cov):
+        return confidence_sequence(p, log_normal_interval(p, cov, 0.95), cov, 0.1, 0.95)
+
+    ends = np.vectorize(find_ends)(np.maximum(estimates, 1e-9) / 100, covs)
     missed = ((ends[0] > 0.01) | (ends[1] < 0.01)).any(axis=1).sum()
     assert missed <= stats.binom.ppf(0.999, runs, 0.05)
     assert (np.abs(np.log(estimates[:, 4:])) > 1.96 * covs[:, 4:]).any(axis=1).sum() > 0.2 * runs
-    low, high = confidence_sequence(1e-3, 0.05, 0.05, 0.95)  # at its target: 3.036 in place of 1.960
-    assert np.log(high / low) / 2 == pytest.approx(3.036 * 0.05, rel=1e-3)
+    low, high = confidence_sequence(1e-3, (8e-4, 1.4e-3), 0.05, 0.05, 0.95)  # at its target: 3.036 in place of 1.960
+    assert np.log([low, high]) == pytest.approx(np.log(1e-3) + 3.036 / 1.960 * np.log([0.8, 1.4]), rel=1e-4)
 
 
 def test_weights_far_outside_the_range_of_floats():

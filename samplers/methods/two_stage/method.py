@@ -193,12 +193,14 @@ def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Genera
             if _gives_up(run, state, refinement, proposal, number, final=final):
                 return (yield from _fall_back(run, state, exploration.levels))
     except Interrupted:
+        if not state.history.batches:  # nothing is known yet
+            raise
         return _estimate_early(run, state)
     outcome = yield from _estimate(run, state, refinement, proposal)
     if budget >= BUDGET.sufficient:
         return outcome
     about = f"A search of {budget:,} simulations misses one of two like regions in up to 30 % of runs"
-    return outcome.remark_first(f"{about}; {BUDGET.sufficient:,} are recommended.")
+    return replace(outcome, warnings=(*outcome.warnings, f"{about}; {BUDGET.sufficient:,} are recommended."))
 
 
 def _draw_first(run: SearchRun, state: RunState) -> SimulationSteps[RunState]:

@@ -87,8 +87,6 @@ class MultipleImportanceSample:
 
 MAX_LOG_WEIGHT = 700.0
 """exp(709) is the largest number; base draws bound all weights that matter far below."""
-MAX_TYPICAL_SHARE = 0.25
-"""More in one draw would be met often enough to be seen; a typical weight beyond is of a place without failures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,14 +163,14 @@ class StratifiedSample:
         """Coefficient of variation of `p`; inf without a failing draw.
 
         From the variance within the components. The square of the largest term, met or typical of a region (at most
-        MAX_TYPICAL_SHARE of p), is added for draws as heavy as that which have not been met.
+        `DOUBT.max_point_share` of p), is added for draws as heavy as that which have not been met.
         """
         if len(self.draws.f) == 0:
             return math.inf
         many = self.counts >= 10
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
-        typical = min(float(self.typical.max(initial=0.0)), MAX_TYPICAL_SHARE * self.draws.n * self.p)
+        typical = min(float(self.typical.max(initial=0.0)), DOUBT.max_point_share * self.draws.n * self.p)
         largest = max(math.exp(float(self.draws.log_weights.max())), typical)
         return math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p)
 

@@ -37,12 +37,20 @@ def test_noise_does_not_count_as_dimensions_and_slow_simulations_are_few(seconds
     assert (result.method.name, result.n_sim) == (name, 6000 if name == "two-stage" else 1000)
 
 
-def test_subset_simulation_goes_on_from_the_base_draws_where_nothing_is_to_be_learned():
+def test_subset_simulation_has_the_rest_where_nothing_is_to_be_learned():
     result = samplers.estimate(ring(), seed=1, max_sim=300)
     assert result.choice.startswith("adss: 300 simulations for 50 dimensions, kriging explains ")
     assert f"chosen {result.choice}" in str(result)
     assert sum(level.n_sim for level in result.trace) == result.n_sim <= 300
-    assert result.base_draws == 100 and 0 < result.interval[0] < 1e-3 < result.interval[1] < 0.05
+    assert result.trace[0].n_sim == 100 and 0 < result.interval[0] < 1e-3 < result.interval[1] < 0.2
+
+
+def test_a_run_that_is_stopped_where_another_method_has_begun_keeps_what_is_known():
+    """f falls by steps, and jumps to failure: two-stage has the rest from 200 simulations on."""
+    problem = samplers.FunctionProblem(lambda u: np.where(np.floor(3 * u[:, :2]).sum(axis=1) > 10.5, -1.0, 1.0), 3)
+    assert samplers.estimate(problem, seed=0, max_sim=900).choice.startswith("two-stage: 900 simulations")
+    result = samplers.estimate(problem, seed=0, max_sim=900, stop=lambda at: at.n_sim >= 200)
+    assert (str(result.status), result.n_sim, result.p) == ("stopped", 200, 0.0) and 0.1 < result.interval[1] < 0.3
 
 
 def test_without_a_failure_the_answer_is_a_bound_the_nearest_approach_and_what_to_do():
