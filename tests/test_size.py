@@ -17,7 +17,7 @@ LIMITS = {
     "functions": 3_075,
     "classes": 462,
     "import lines, percent of code": 10.8,
-    "test lines": 31_560,
+    "test lines": 31_565,
     "pages": 18,
     "words of pages": 40_000,
     "files entered by an estimate": 42,
