@@ -309,9 +309,10 @@ class _Sum:
             ends = min(old.interval[0], found.interval[0]), max(old.interval[1], found.interval[1])
             return replace(of, interval=ends, base_draws=drawn, warnings=(*of.warnings, about)), behind
         if found.p == 0 < old.p and found.counts is not None and not is_resolved(old):
-            # plain draws say that what a search has not resolved is rare
-            high = max(clopper_pearson(0, drawn, self.goal.confidence)[1], old.p)
-            return replace(old, interval=(old.interval[0], high), base_draws=drawn), n_old
+            # plain draws say that what a search has not resolved is rare; one heavy draw may even be above their end
+            most = clopper_pearson(0, drawn, self.goal.confidence)[1]
+            met = old if old.p <= most else dilute(old, found, n_old / (n_old + n))
+            return replace(met, interval=(min(met.interval[0], most), max(most, met.p)), base_draws=drawn), n_old
         if found.p == 0 == old.p:
             return self._bound(found, drawn), n
         if found.p == 0 < old.p:  # what the old run met is not to be lost
