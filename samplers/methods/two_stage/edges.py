@@ -123,7 +123,7 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
             loosely = fit is _fit_plane and len(rows) == len(y)
             if found and (found.locate_boundary() or (loosely and found.explained > PLANES.min_r2)):
                 fits.append(found)
-    few = _fit_few(u, y) if len(y) <= u.shape[1] + MIN_POINTS else None
+    few = _fit_few(u, y) if MIN_POINTS < len(y) <= u.shape[1] + MIN_POINTS else None
     if few is not None and few.explained > PLANES.min_r2:
         fits.append(few)
     kinds = [fit for fit in fits if len(fit.errors) == 1], [fit for fit in fits if len(fit.errors) > 1]
