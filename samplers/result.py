@@ -269,8 +269,8 @@ class Estimate(EstimateData, Kept):
         return axes
 
     @property
-    def _headline(self) -> str:
-        """p, or where p = 0 the bound and what it rests on."""
+    def headline(self) -> str:
+        """p in words or, where p = 0, the bound and what it rests on."""
         if self.p > 0:
             return f"P[f <= {self.gamma:g}] = {self.p:.3e}"
         failing = f"only {self.failures.total:,} of the search" if self.failures.total else "no failure"
@@ -279,14 +279,14 @@ class Estimate(EstimateData, Kept):
 
     def __repr__(self) -> str:
         ends, ended = "[{:.3e}, {:.3e}]".format(*self.interval), describe_outcome(self.status, self.warnings)
-        return f"<Estimate {self._headline} {ends}, {self.n_sim:,} simulations, {self.method.name}, {ended}>"
+        return f"<Estimate {self.headline} {ends}, {self.n_sim:,} simulations, {self.method.name}, {ended}>"
 
     def __str__(self) -> str:
         (low, high), looks = self.interval, self.sequence
         gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
         cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
         lines = [
-            self._headline,
+            self.headline,
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
             *(["  at every look [{:.3e}, {:.3e}], as the run stopped on what it saw".format(*looks)] if looks else []),
             *(f"  {part}" for part in self.parts),

@@ -248,7 +248,7 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
     estimate, question = report.estimate, report.study.question
     odds = f" (1 in {1 / estimate.p:,.0f} scenarios)" if 0 < estimate.p < 0.1 else ""
     average = f", {report.average}" if report.average else ""
-    head = f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{odds}   {question.env_id}, ego {question.ego}{average}"
+    head = f"{estimate.headline}{odds}   {question.env_id}, ego {question.ego}{average}"
     console.print(head, style="bold")
     ends = "{:.3e} to {:.3e}".format(*estimate.interval)
     if report.verdict is not None:
