@@ -270,7 +270,7 @@ class Estimate(EstimateData, Kept):
 
     @property
     def headline(self) -> str:
-        """p in words or, where p = 0, the bound and what it rests on."""
+        """P in words or, where p = 0, the bound and what it rests on."""
         if self.p > 0:
             return f"P[f <= {self.gamma:g}] = {self.p:.3e}"
         failing = f"only {self.failures.total:,} of the search" if self.failures.total else "no failure"
