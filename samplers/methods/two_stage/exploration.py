@@ -140,9 +140,9 @@ class ExplorationPlanner:
         threshold = next_level(points.f, EXPLORATION.level_fraction, self.gamma)
         if threshold == self.gamma:
             return Status.CONVERGED
-        if threshold is None or depth >= 30:
+        if threshold is None or depth >= 30:  # the budget ends the descent first unless f ties
             return Status.STALLED
-        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // 3]
+        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // 3]  # chains take two steps or more
         steps = max(1, math.ceil(self.n / len(seeds)) - 1)
         if n_sim + steps * len(seeds) > self.budget:
             return Status.BUDGET
@@ -158,7 +158,7 @@ def descend_levels(
 
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
-    kernel = Kernel("conditional", 0.6, EXPLORATION.level_acceptance)
+    kernel = Kernel("conditional", 0.6, EXPLORATION.level_acceptance)  # begins as `AdaptiveSubsetSimulation` does
     gamma = goal.gamma
     planner = ExplorationPlanner(gamma, n, most - simulator.n_sim)
     levels, thresholds = list[Growth](), list[float]()
@@ -388,7 +388,7 @@ def find_slopes(
     points = _collect_points(exploration, gamma, rng)
     first = max(n - n // 2, LEAST_SLOPES)
     chosen = np.argsort(points.turns, kind="stable")[:first]
-    slopes = yield from _differentiate(simulator, points.u[chosen], 0.05)
+    slopes = yield from _differentiate(simulator, points.u[chosen], 0.05)  # f bends little over it
     for size in ((n - first + 1) // 2, (n - first) // 2):
         if not _have_few_directions(slopes):
             return None
@@ -396,7 +396,7 @@ def find_slopes(
         chosen = _choose_unexplained(points, size, axes)
         more = yield from _differentiate(simulator, points.u[chosen], 0.05)
         slopes = np.concatenate([slopes, more])
-        if ((more @ axes) ** 2).sum() >= 0.99 * len(more):
+        if ((more @ axes) ** 2).sum() >= 0.99 * len(more):  # nothing new
             break
     return _leading_directions(slopes) if _have_few_directions(slopes) else None
 
@@ -477,5 +477,5 @@ def _have_few_directions(slopes: FloatArray) -> bool:
 def _leading_directions(slopes: FloatArray) -> FloatArray:
     """Return the principal directions (d, r) of unit gradients (k, d)."""
     _, sizes, axes = np.linalg.svd(slopes, full_matrices=False)
-    used = sizes**2 > 0.005 * len(slopes)
+    used = sizes**2 > 0.005 * len(slopes)  # noise of f bends gradients less
     return np.asarray(axes[used][: SLOPES.most_axes].T)

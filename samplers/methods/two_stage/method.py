@@ -314,8 +314,10 @@ def _gives_up(
     # Ends of lines in a ring are no typical failures.
     described = refinement.exploration.noisy or refinement.within is not None
     doubtful = final and not described and last.ess < PROPOSAL.good_rate * last.n
+    if not doubtful:
+        return False
     typical = typical_weights(refinement, proposal, state.history)
-    return doubtful and float(np.median(typical)) > FALLBACK.max_typical * last.p
+    return float(np.median(typical)) > FALLBACK.max_typical * last.p
 
 
 def _fall_back(run: SearchRun, state: RunState, levels: int) -> Steps:

@@ -158,8 +158,8 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
     along = float(weights @ (u @ v - norm) ** 2)
     if dim > HIGH_DIM:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
-        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), 0.5)
-        variance = np.array([min(along * (1 - excess) + excess, 4.0)])
+        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), 0.5)  # in hundreds of dimensions all is noise
+        variance = np.array([min(along * (1 - excess) + excess, 4.0)])  # more comes from points of another region
         raised = inflate_variances(variance, ess)
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
     centred = (u - mean) * np.sqrt(weights)[:, None]  # E[u u'] less squares loses digits far out
@@ -186,7 +186,7 @@ def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Genera
     for k in (size for size in FIT.sizes if size <= most):
         if k > 1 and (k > points.n_groups or points.ess < 4.0 * k):
             break
-        restarts = 1 if k == 1 else 3
+        restarts = 1 if k == 1 else 3  # k-means++ draws the centres
         found = max(
             (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
             key=lambda mix: mix.score,
@@ -195,7 +195,7 @@ def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Genera
             best, worse = found, 0
         else:
             worse += 1
-        if worse == 2:
+        if worse == 2:  # the score is uneven in their number: after one that is worse, a better one may follow
             break
     assert best is not None  # one component can always be fitted
     return best
@@ -250,10 +250,10 @@ def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
         lambda total: 1e-3 * abs(total),
     )
     dim = points.u.shape[1]
-    most = 2.0 * dim
+    most = 2.0 * dim  # with all d (d + 1) / 2 of them some dozens of points would never have a second component
     covariances = [min((1 - share) * dim * (dim + 1) / 2, most) for share in fit.target_shares]
     parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
-    penalty = 0.5 * math.log(max(points.ess, 3.0)) * parameters
+    penalty = 0.5 * math.log(max(points.ess, 3.0)) * parameters  # the logarithm would fall under 1 with fewer
     return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
 
 
@@ -267,7 +267,7 @@ def refit_components(
     """
     weights = truncate_weights(log_weights)
     log_mixing = np.zeros(len(components))
-    for _ in range(2):
+    for _ in range(2):  # the next rounds go on from there
         shares = posterior(log_ratios(components, u) + log_mixing[:, None])
         log_w = np.log(np.maximum(weights, TINY_WEIGHT))
         components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
@@ -281,10 +281,10 @@ def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_w
     Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
     """
     count = float(shares.sum())
-    if count < 5:
+    if count < 5:  # it stays where it is
         return component
     wanted = max(FIT.ess[0], FIT.ess[1] * u.shape[1])
-    wanted = min(wanted, count / 3.0)
+    wanted = min(wanted, count / 3.0)  # no more is asked of it than a third of its points
     log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
     for power in np.arange(1.0, 0.0, -0.1):
         w = normalise_weights(log_shares + power * log_weights)
@@ -314,12 +314,12 @@ def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     of what |u|^2 exceeds the start by.
     """
     square = np.einsum("ij,ij->i", u, u)
-    start = 0.98 * weighted_quantile(square, weights, 0.01)
+    start = 0.98 * weighted_quantile(square, weights, 0.01)  # the least of few lies beyond the edge of many
     outside = square > start
     excess, w = square[outside] - start, weights[outside]
     mean = float(np.average(excess, weights=w))
     variance = max(float(np.average((excess - mean) ** 2, weights=w)), MIN_VARIANCE)
-    shape = max(mean * mean / variance, 0.3)
+    shape = max(mean * mean / variance, 0.3)  # with less nearly all draws are at the start
     return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))
 
 

@@ -259,7 +259,7 @@ def build_proposal(
         explored = np.isin(kinds, ["explored", "linear", "spread"])
         weights = np.where(explored, np.maximum(weights, 0.01), weights)  # kept until the last round
         keeps = keeps | explored
-    weights = np.where((weights < 0.004) & ~keeps, 0.0, weights)
+    weights = np.where((weights < 0.004) & ~keeps, 0.0, weights)  # some draws in thousands
     return MixtureProposal(candidates, FloorIndex.of(floors, len(weights)).apply(weights / weights.sum()))
 
 
@@ -318,7 +318,7 @@ def _fit_radial_components(state: RefinementState, history: MultipleImportanceSa
     if state.dim < 2:
         return []
     radial = [fit_radial(state.points, np.ones(len(state.points)))]
-    if len(history.u) >= 20:
+    if len(history.u) >= 20:  # moments of |u|^2 need so many
         log_w = history.log_weights
         radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
     return [ProposalComponent(component, "radial") for component in radial]

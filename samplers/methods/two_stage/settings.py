@@ -26,8 +26,8 @@ class EXPLORATION:
     base = 500  # Base draws; five levels of a tenth each reach 1e-5 from there
     wide = ((1.5, 400), (2.2, 80), (3.0, 60), (4.2, 60))
     """(s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15, at s = 4.2 one at beta = 6 by one in
-    13; at s = 1.5 a ball that f does not announce is hit two to three times as often as by base draws. With 120, 120
-    and 80 of the first three, 7 of 20 runs on pit_d5 missed its ball."""
+    13; at s = 1.5 the ball of pit_d5, which f does not announce, is hit 1.6 times as often as by base draws. With 120,
+    120 and 80 of the first three, 7 of 20 runs missed it."""
     level = 250  # Points of each level of subset simulation
     level_fraction = 0.1  # Conditional probability of a level (Au and Beck 2001)
     level_acceptance = 0.44  # Acceptance that its chains are adapted to (Papaioannou, Betz, Zwirglmaier, Straub 2015)
@@ -125,7 +125,8 @@ class PROPOSAL:
     }
     """Shares of the kinds where nothing is known yet; of those present, in proportion. Without a kind the stated
     variance (median) is 131 times as large on sphere_d20 (radial), 15 times on two_d30 and 4 times on three_d6 and
-    steps_d6 (linear), 20 times on corner_d5 (corner), 20 times on cones_d13 (explored) and 14 times (directional)."""
+    steps_d6 (linear), 20 times on corner_d5 (corners, linear too), 20 times on cones_d13 (explored) and 4 times on
+    sector_d6 (directional)."""
 
 
 class FALLBACK:

@@ -119,7 +119,7 @@ class StratifiedSample:
         drawn = proposal.drawn(batch.counts)
         ratios, log_weights = drawn.kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
-        calibration = calibrate(ratios, owner, 30)
+        calibration = calibrate(ratios, owner, 30)  # slopes of fewer draws for each control bias
         y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         log_weights = log_weights + np.log(calibration.factors)
@@ -167,7 +167,7 @@ class StratifiedSample:
         """
         if len(self.draws.f) == 0:
             return math.inf
-        many = self.counts >= 10
+        many = self.counts >= 10  # a handful has no variance: its second moment stands in
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         typical = min(float(self.typical.max(initial=0.0)), DOUBT.max_point_share * self.draws.n * self.p)
