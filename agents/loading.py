@@ -24,6 +24,7 @@ from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.needs import RULE_BASED_EGOS, wrap_callable
 from rare_envs.plugins import EgoGone, did_you_mean, import_object, is_policy, one_line, refuse_ego
+from rare_envs.startup import advise_install
 
 EGO_NAMES = (*RULE_BASED_EGOS, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
 EXPECTED_EGO: Final = (
@@ -178,7 +179,7 @@ def _load_elsewhere(text: str, *how: Any) -> Any:
     try:
         from agents.remote.client import connect, isolate
     except ImportError as error:
-        raise ValueError(f"{text!r} needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
+        raise ValueError(f"{text!r} needs pyzmq and msgpack: {advise_install('remote')}.") from error
     try:
         return isolate(_require_inner_ego(text), *how) if text.startswith("process:") else connect(text)
     except EgoGone as error:

@@ -23,6 +23,7 @@ from agents.saved_ego import SavedEgo
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.files import replace_file
 from rare_envs.plugins import one_line
+from rare_envs.startup import advise_install
 
 METADATA_KEY = "rare_envs"
 """Entry of a file's metadata in which `export_onnx` describes observations and actions."""
@@ -53,7 +54,7 @@ class OnnxEgo:
         try:
             import onnxruntime
         except ImportError as error:
-            raise ValueError(f"{str(path)!r} needs onnxruntime: pip install 'rare-envs[onnx]'.") from error
+            raise ValueError(f"{str(path)!r} needs onnxruntime: {advise_install('onnx')}.") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
@@ -199,7 +200,7 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> tuple[float, int]:
     try:
         import onnx
     except ImportError as error:
-        raise ValueError("Exporting needs onnx and onnxruntime: pip install 'rare-envs[onnx]'.") from error
+        raise ValueError(f"Exporting needs onnx and onnxruntime: {advise_install('onnx')}.") from error
     space, action = ego.observation_space, ego.action_space
     if not isinstance(space, spaces.Box) or (ego.frames is not None and (ego.frames[1] or len(space.shape) != 1)):
         raise ValueError(f"Cannot export a policy that observes {space}; expected one Box of numbers.")

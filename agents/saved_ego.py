@@ -24,6 +24,7 @@ from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin
 from agents.sb3_archive import build_policy, check_space, find_algorithm, read_archive
 from rare_envs.egos.wrappers import UNBOUNDED, WrappedPolicy, find_stacking
 from rare_envs.plugins import one_line
+from rare_envs.startup import advise_install
 
 HUB_PREFIX = "hf:"
 """Beginning of the names of policies of the Hub."""
@@ -286,7 +287,7 @@ def find_hub_model(text: str, download: bool = True) -> Path | None:
         if not download:
             return None
         raise ValueError(
-            f"{text!r} needs huggingface_hub: pip install 'rare-envs[hub]', or download the .zip yourself and name it."
+            f"{text!r} needs huggingface_hub: {advise_install('hub')}, or download the .zip yourself and name it."
         ) from error
 
     def fetch(revision: str | None, **how: Any) -> Path:

@@ -42,14 +42,29 @@ def find_missing_libraries(modules: tuple[str, ...] = DRIVING) -> tuple[str, ...
     return tuple(name for name in modules if find_spec(name) is None)
 
 
+def advise_install(extra: str) -> str:
+    """Return the command that installs an extra of this package from where the package came from."""
+    import json
+    import shlex
+    from importlib import metadata
+
+    root, origin = os.path.dirname(os.path.dirname(os.path.abspath(__file__))), None
+    if os.path.isfile(os.path.join(root, "pyproject.toml")):  # a clone
+        return f"pip install -e {shlex.quote(f'{root}[{extra}]')}"
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        origin = metadata.distribution("rare-envs").read_text("direct_url.json")  # not of those from an index
+    found = json.loads(origin or "{}")
+    vcs = found.get("vcs_info")
+    source = f" @ {vcs['vcs']}+{found['url']}@{vcs['commit_id']}" if vcs else f" @ {found['url']}" if found else ""
+    return f"pip install {shlex.quote(f'rare-envs[{extra}]{source}')}"
+
+
 def require_libraries() -> None:
     """Raise an error of one line that says what to install if a library of `DRIVING` is missing."""
     missing = find_missing_libraries()
     if missing:
         names = ", ".join(missing)
-        raise ImportError(
-            f"rare_envs, agents and training need {names}, not installed: pip install 'rare-envs[driving]'."
-        )
+        raise ImportError(f"rare_envs, agents and training need {names}, not installed: {advise_install('driving')}.")
 
 
 def is_command_line() -> bool:

@@ -205,7 +205,7 @@ class RayCluster(_Processes):
         try:
             import ray
         except ImportError as error:
-            raise ValueError("The executor ray needs Ray: pip install 'rare-envs[ray]'.") from error
+            raise ValueError("The executor ray needs Ray: pip install ray.") from error
         started = not ray.is_initialized()
         if started:
             self._start(ray)

@@ -1,6 +1,6 @@
 """Egos in other processes and on other machines: client, server and protocol.
 
-`EgoServer` is imported on first use, since pyzmq and msgpack are optional: `pip install 'rare-envs[remote]'`.
+`EgoServer` is imported on first use, since pyzmq and msgpack are optional, of the extra `remote`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Signal temporal logic: the robustness of a formula over an episode, by rtamt (`pip install rare-envs[stl]`).
+"""Signal temporal logic: the robustness of a formula over an episode, by rtamt (the extra `stl`).
 
 References:
     Donze and Maler, "Robust satisfaction of temporal logic over real-valued signals", 2010; Nickovic and Yamaguchi,
@@ -21,6 +21,7 @@ from torch import Tensor
 from rare_envs.measures.base import Moment, Trace, TraceMeasure
 from rare_envs.measures.longitudinal import drac, thw, ttc
 from rare_envs.measures.two_dimensional import clearance
+from rare_envs.startup import advise_install
 
 ROBUSTNESS_MAX = 1e6
 """Robustness is cut here, where a formula says nothing of the signals."""
@@ -105,7 +106,7 @@ def _parse(formula: str, dt: float) -> tuple[Any, list[str]]:
             import rtamt
     except ImportError as error:
         raise ImportError(
-            "Signal temporal logic needs rtamt, on Python 3.11 or earlier: pip install 'rare-envs[stl]'."
+            f"Signal temporal logic needs rtamt, on Python 3.11 or earlier: {advise_install('stl')}."
         ) from error
     if not isinstance(formula, str):
         raise ValueError(f"Expected a formula such as 'always (gap > 2)', got {formula!r}.")

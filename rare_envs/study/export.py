@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.problem import DrivingProblem
-from rare_envs.startup import __version__
+from rare_envs.startup import __version__, advise_install
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.traffic.road import ReferenceLine, Road, list_cells
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -138,9 +138,7 @@ def import_scenariogeneration(part: str) -> Any:
     try:
         return importlib.import_module(f"scenariogeneration.{part}")
     except ImportError as error:
-        raise ValueError(
-            'OpenSCENARIO and OpenDRIVE need scenariogeneration: pip install "rare-envs[export]".'
-        ) from error
+        raise ValueError(f"OpenSCENARIO and OpenDRIVE need scenariogeneration: {advise_install('export')}.") from error
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from rare_envs.startup import DRIVING, __version__
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("agents", "rare_envs", "samplers", "training")
+FROM_CLONE = f"pip install -e {shlex.quote(f'{ROOT}[driving]')}"
+"""What installs the extra, in every working directory."""
 OPTIONAL = {"dask", "openturns", "pandas", "ray"}
 """Libraries that users bring themselves, or that an extra of `samplers` installs."""
 
@@ -98,7 +101,7 @@ def bare(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
 def test_importing_a_package_without_its_libraries_names_the_command(package: str) -> None:
     code = f"import sys; sys.modules.update(torch=None, gymnasium=None); import {package}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    line = "rare_envs, agents and training need gymnasium, torch, not installed: pip install 'rare-envs[driving]'."
+    line = f"rare_envs, agents and training need gymnasium, torch, not installed: {FROM_CLONE}."
     assert done.stderr.splitlines()[-1] == f"ImportError: {line}"
 
 
@@ -115,4 +118,4 @@ def test_a_command_that_needs_the_extra_says_so_in_one_line(bare: Callable[..., 
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
         command = "estimate" if words[0] == "estimate" else "corpus run"
         assert done.stderr.startswith(f"rare-envs: rare-envs {command} needs ")
-        assert done.stderr.endswith("torch, yaml, not installed: pip install 'rare-envs[driving]'.\n")
+        assert done.stderr.endswith(f"torch, yaml, not installed: {FROM_CLONE}.\n")

@@ -428,7 +428,7 @@ def test_a_cluster_that_is_gone_does_not_start_or_is_not_installed_is_one_line(
             estimate(problem(), RayCluster(address), 10)
         assert str(refused.value) == f"{said} (OSError: The current node timed out during startup. See the logs.)."
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r"^The executor ray needs Ray: pip install 'rare-envs\[ray\]'\.$"):
+    with pytest.raises(ValueError, match=r"^The executor ray needs Ray: pip install ray\.$"):
         estimate(problem(), "ray", 10)
 
 

@@ -21,6 +21,7 @@ from agents import LearnedDriver, Provenance, save_driver
 from agents.learned.networks import Policy
 from rare_envs.devices import find_device
 from rare_envs.files import replace_text
+from rare_envs.startup import advise_install
 from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.imitation.config import Config
@@ -228,7 +229,7 @@ def _tensorboard(folder: Path | None, update: int) -> contextlib.AbstractContext
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
-        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
+        raise ValueError(f"Logs need TensorBoard: {advise_install('logs')}, or leave logs out.") from error
     return contextlib.closing(SummaryWriter(str(folder), purge_step=update + 1))
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.startup import advise_install
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder
 from rare_envs.study.cli import shell
 from rare_envs.study.cli.shell import Answer, command
@@ -204,7 +205,7 @@ def serve_ego_command(
         from agents.remote.protocol import read_secret
         from agents.remote.server import EgoServer
     except ImportError as error:
-        raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
+        raise BadInput(f"Serving needs pyzmq and msgpack: {advise_install('remote')}.") from error
     with as_bad_input(ValueError, OSError):
         loaded = agents.load_ego(ego, **asked)
         if not is_policy(loaded):

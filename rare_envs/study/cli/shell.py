@@ -24,7 +24,7 @@ from typer import Argument, Option
 from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone
-from rare_envs.startup import find_missing_libraries, restore_signals, use_one_thread
+from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
 from rare_envs.study.arguments import BadInput, ExecutorOptions, Question, option_name, read_whole
 
 DOUBTFUL = 3
@@ -93,7 +93,7 @@ class OneLineErrors(SummarisedCommands):
             missing = ", ".join(find_missing_libraries())
             if not missing:
                 raise
-            _fail(f"{self._find_path(words)} needs {missing}, not installed: pip install 'rare-envs[driving]'.")
+            _fail(f"{self._find_path(words)} needs {missing}, not installed: {advise_install('driving')}.")
         except BrokenPipeError:  # whoever read the answer has enough of it
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing more to say when Python flushes
             sys.exit(128 + _SIGPIPE)

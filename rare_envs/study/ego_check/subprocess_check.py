@@ -28,7 +28,7 @@ from rare_envs.egos.needs import AMBIGUOUS, TAKEN_AS_ACCELERATIONS
 from rare_envs.plugins import EgoGone, NoAnswer, reason_of
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.observation import map_kinds, observation_space
-from rare_envs.startup import use_one_thread
+from rare_envs.startup import advise_install, use_one_thread
 from rare_envs.study.arguments import BadInput, Question, as_bad_input
 from rare_envs.study.ego_check import Finding
 from rare_envs.study.ego_check.checks import EGO_CHECKS, Probe
@@ -147,7 +147,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
         from agents.remote import protocol
         from agents.remote.client import TIMEOUT, LinkError, RemoteError, ServerLink, parse_address
     except ImportError:
-        yield Finding("protocol", "fail", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
+        yield Finding("protocol", "fail", "pyzmq and msgpack are not installed", advise_install("remote"))
         return
     address, settings = parse_address(spec)
     link, numbers = ServerLink(address, protocol.read_secret()), itertools.count(1)

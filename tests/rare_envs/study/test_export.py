@@ -95,7 +95,7 @@ def _sample_geometry(geometry: Any) -> NDArray[np.float64]:
     return np.column_stack((s + p, x + u * cos - v * sin, y + u * sin + v * cos, heading + turn))
 
 
-pytest.importorskip("scenariogeneration", reason='scenariogeneration comes with "rare-envs[export]"')
+pytest.importorskip("scenariogeneration", reason="scenariogeneration comes with the extra export")
 
 CRASH = np.array([20.0, 12.0, 12.0, 6.0, 40.0, 3.5])
 """A cut-in at 6 m and 8 m/s slower."""

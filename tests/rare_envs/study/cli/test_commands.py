@@ -23,6 +23,7 @@ import samplers
 import training.fit.recordings as fitting
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.startup import advise_install
 from rare_envs.study.cli.listing import TITLES
 from rare_envs.study.cli.runs import FAILS
 from rare_envs.study.corpus import read_corpus
@@ -162,7 +163,7 @@ def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.Monkey
     PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, seed=0, policy_kwargs={"net_arch": [4]}).save(model)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "onnx", None)
-        said = "Exporting needs onnx and onnxruntime: pip install 'rare-envs[onnx]'."
+        said = f"Exporting needs onnx and onnxruntime: {advise_install('onnx')}."
         assert_refused(cli("export-ego", model, out), said)
     assert not out.exists()
     pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
