@@ -131,6 +131,11 @@ def find_ego_kind(spec: str) -> str:
     return next((kind for kind, (is_one, _) in KINDS.items() if is_one(spec)), "unknown")
 
 
+def names_function(spec: str) -> bool:
+    """Return whether a name has the form of `module:function`, which a file may have too."""
+    return ":" in spec and "/" not in spec and spec.partition(":")[0] not in RULE_BASED_EGOS
+
+
 def strip_prefixes(spec: str) -> str:
     """Return the ego inside `noisy:` and `process:`, without their settings."""
     while spec.startswith(("noisy:", "process:")):
@@ -232,10 +237,7 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
         lambda spec: spec.endswith(".zip") or Path(spec).is_file(),
         lambda text, *how: load_saved_ego(Path(text), *how),
     ),
-    "function": (
-        lambda spec: ":" in spec and "/" not in spec and spec.partition(":")[0] not in RULE_BASED_EGOS,
-        _call_factory,
-    ),
+    "function": (names_function, _call_factory),
 }
 """Kinds of ego, the first that holds of a name counts: whether it does, and how the ego is loaded."""
 

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,20 +26,35 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     """Yield the path of a draft in the same folder; it takes the file's place when the block ends without an error.
 
     The draft is on the disk before it takes the place, and the change of the folder after it: a power cut leaves the
-    earlier file or the new one. It keeps the ending of the name, which libraries read the format from. A link stays
-    one: the file that it leads to is replaced.
+    earlier file or the new one. It keeps the ending of the name, which libraries read the format from. A folder of
+    somebody else may hold links: none is written through, as that in the file's place is replaced itself, and the draft
+    is a new file by a name that nobody foresees. Others may do no more with the file than with the one before it.
     """
-    path = Path(os.path.realpath(path))
-    draft = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    path = Path(path).absolute()  # the working directory may change
+    draft = path.with_name(f".{path.stem[:50]}.{secrets.token_hex(8)}.part{path.suffix}")
+    os.close(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o666))
     try:
         yield draft
         _sync(draft)
         with contextlib.suppress(FileNotFoundError):
-            draft.chmod(path.stat().st_mode & 0o7777)
+            if stat.S_ISREG(before := path.lstat().st_mode):
+                draft.chmod(before & draft.stat().st_mode)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
     _sync(path.parent)
+
+
+def refuse_folder(path: Path) -> None:
+    """Refuse to write a file where there is a folder; a link to one is none."""
+    if path.is_dir() and not path.is_symlink():
+        raise ValueError(f"Cannot write {str(path)!r}: there is a folder of that name.")
+
+
+def refuse_link(path: Path) -> None:
+    """Refuse a link in the place of a folder inside one of somebody else: what is written there would be elsewhere."""
+    if path.is_symlink():
+        raise ValueError(f"{str(path)!r} is a link, and nothing is written through one: remove it.")
 
 
 def replace_text(path: str | Path, text: str) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import importlib
-import importlib.util
 import inspect
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any, ClassVar, NoReturn
 
@@ -20,15 +19,21 @@ _MAX_WORDS = 200
 
 
 def import_module(name: str, purpose: str) -> ModuleType:
-    """Return a module that a user names, for a purpose that errors name; the working directory is searched first."""
-    here = os.getcwd()
-    sys.path.insert(0, here)  # as `python -m` does, and console scripts do not
+    """Return a module that a user names, for a purpose that errors name; the working directory is searched first.
+
+    Its own imports are found there too where it lies there itself; a module from elsewhere gets nothing from there.
+    """
+    here, top = os.getcwd(), name.partition(".")[0]
+    importlib.invalidate_caches()
+    own, found = (PathFinder.find_spec(top, places) for places in ([here], [here, *sys.path]))
+    lies_here = own is not None and found is not None and own.origin == found.origin
+    sys.path[:0] = [here] * lies_here  # as `python -m` does, and console scripts do not
     try:
         return importlib.import_module(name)
     except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
         raise ValueError(f"Cannot import {name!r} for {purpose}: {one_line(error)}.") from error
     finally:
-        with contextlib.suppress(ValueError):
+        if lies_here and here in sys.path:
             sys.path.remove(here)
 
 

@@ -32,12 +32,14 @@ from samplers.workers import (
     ExecutorError,
     Reply,
     WorkerLost,
+    begin_as_ever,
     compute_in_worker,
     describe,
     describe_loss,
     end_with,
     name_process,
     pack,
+    starting_processes,
 )
 
 ATTEMPTS = 3
@@ -460,7 +462,8 @@ class _LocalProcess:
 
     def submit(self, function: Any, *arguments: Any) -> Any:
         """Submit a call."""
-        job = self._executor.submit(function, *arguments)
+        with starting_processes():
+            job = self._executor.submit(function, *arguments)
         self._numbers |= set(self._executor._processes or ())
         return job
 
@@ -474,6 +477,7 @@ class _LocalProcess:
 
 def _begin_process(driver: int) -> None:
     """Let this process end with its driver, and lead a group, which Ctrl-C does not reach: the driver decides."""
+    begin_as_ever()
     end_with(driver)
     if hasattr(os, "setsid"):
         os.setsid()

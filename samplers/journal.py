@@ -34,10 +34,9 @@ SYNC_SECONDS = 1.0
 """Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the chunk."""
 FORMAT = 0x72656A31
 """Application id of the file."""
-TABLES = (
-    f"PRAGMA application_id = {FORMAT}",
+TABLE = (
     "CREATE TABLE chunks (id INTEGER PRIMARY KEY, points TEXT UNIQUE, width INTEGER, n_sim INTEGER, seconds REAL, "
-    "notes TEXT, numbers BLOB, digest BLOB)",
+    "notes TEXT, numbers BLOB, digest BLOB)"
 )
 COLUMNS = "id, points, width, n_sim, seconds, notes, numbers"
 INSERT = f"INSERT OR IGNORE INTO chunks ({COLUMNS}, digest) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
@@ -116,9 +115,7 @@ class Journal:
         """Begin a journal in the place of one without finished simulations, or of any (`replace`), that is not open."""
         if _has_simulations(path) and not replace:
             raise JournalError(f"There is a journal already, {str(path)!r}: remove it, or choose another file.")
-        for name in (path, _wal(path)):
-            name.unlink(missing_ok=True)
-        os.close(os.open(path, os.O_CREAT | os.O_EXCL, 0o666))  # raises what is wrong with the place
+        _make(path)
         connection = _connect(path)
         try:
             _fill(connection, [_Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")])
@@ -135,6 +132,7 @@ class Journal:
         Of a damaged one, `mend` keeps what stands before the damage; if that is its first record it is left as it is.
         Raises NothingRecorded for one that was cut before its first record.
         """
+        _check_own(path)
         missing = _count_missing(path)
         try:
             if missing and mend:  # zeros, which no record consists of
@@ -273,19 +271,16 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 
 def _fill(connection: sqlite3.Connection, rows: Iterable[_Row]) -> None:
-    """Write the tables of a new journal and records, all or nothing."""
-    connection.execute("BEGIN")
-    for statement in TABLES:
+    """Write the table of a new journal and records, all or nothing."""
+    for statement in ("BEGIN", f"PRAGMA application_id = {FORMAT}", TABLE):
         connection.execute(statement)
     connection.executemany(INSERT, ((*row, row.digest) for row in rows))
     connection.execute("COMMIT")
 
 
 def _count_missing(path: Path) -> int:
-    """Return how many bytes are missing at the end of a file by its header; raise unless it is an ordinary one."""
+    """Return how many bytes are missing at the end of a file by its header."""
     found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
-        raise JournalError(f"{str(path)!r} is no ordinary file.")
     with path.open("rb") as file:
         header = file.read(HEADER_SIZE)
     if len(header) < HEADER_SIZE and MAGIC.startswith(header[: len(MAGIC)]) and not _wal(path).exists():
@@ -298,9 +293,11 @@ def _count_missing(path: Path) -> int:
 
 def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
     """Return the head of a journal all of whose records match their digests."""
-    if not connection.execute("SELECT 1 FROM sqlite_master").fetchall():
+    schema = [sql for (sql,) in connection.execute("SELECT sql FROM sqlite_master") if sql]
+    if not schema:
         raise NothingRecorded(f"{str(path)!r} was cut before its first record; nothing is recorded in it.")
-    if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT:
+    # a view in the table's place may have rows without end, and triggers change what is written
+    if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT or schema != [TABLE]:
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.")
     notes, head = [row.notes for row in _good_rows(path, connection) if row.id == HEAD], None
     with contextlib.suppress(ValueError, RecursionError):
@@ -329,9 +326,7 @@ def _good_rows(path: Path, connection: sqlite3.Connection) -> Iterator[_Row]:
 def _keep_before(path: Path, number: int) -> None:
     """Replace a journal by one of its records before a damaged one."""
     new = path.with_name(f"{path.name}.mended")
-    for name in (new, _wal(new)):
-        name.unlink(missing_ok=True)
-    new.touch()
+    _make(new)
     with contextlib.closing(_connect(path)) as damaged, contextlib.closing(_connect(new)) as mended:
         _fill(mended, itertools.islice(_good_rows(path, damaged), number))
     _wal(path).unlink(missing_ok=True)
@@ -349,6 +344,30 @@ def _has_simulations(path: Path) -> bool:
         raise
     except JournalError:
         return True
+
+
+def _list_files(path: Path) -> list[Path]:
+    """Return a journal and the files that SQLite keeps beside one."""
+    return [path, *(path.with_name(f"{path.name}-{end}") for end in ("wal", "journal", "shm"))]
+
+
+def _make(path: Path) -> None:
+    """Make an empty file in the place of whatever is there; raise what is wrong with the place."""
+    for name in _list_files(path):
+        name.unlink(missing_ok=True)
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL, 0o666))  # which follows no link
+
+
+def _check_own(path: Path) -> None:
+    """Refuse a journal that is a link or a pipe or has another name too, as SQLite writes in place."""
+    for name in _list_files(path):
+        with contextlib.suppress(FileNotFoundError):
+            found = os.lstat(name)
+            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                raise JournalError(
+                    f"{str(name)!r} is no ordinary file, or has another name too, which would be written to as well: "
+                    "put a copy in its place."
+                )
 
 
 def _wal(path: Path) -> Path:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import Enum
 from html import escape
@@ -76,11 +77,15 @@ def write_object(path: str | PathLike[str], value: object) -> None:
     from safetensors.numpy import save_file
 
     arrays: dict[str, NDArray[Any]] = {}
-    text = json.dumps(_encode(value, arrays), allow_nan=False)
+    text, draft = json.dumps(_encode(value, arrays), allow_nan=False), Path(f"{path}.{secrets.token_hex(8)}.part")
     try:
-        save_file(arrays, str(path), metadata={"format": FILE_FORMAT, _KEY: text})
-    except SafetensorError as error:
+        save_file(arrays, str(draft), metadata={"format": FILE_FORMAT, _KEY: text})
+        draft.replace(path)  # of a link, which is not followed, as of a file
+    except (SafetensorError, OSError) as error:
         raise OSError(f"Cannot write {str(path)!r}: {error}") from error
+    finally:
+        with suppress(OSError):
+            draft.unlink()
 
 
 def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:

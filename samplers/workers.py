@@ -9,6 +9,8 @@ import re
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 from uuid import uuid4
 
@@ -17,6 +19,8 @@ from samplers.method import Request
 
 ENDED_ITSELF = "1"
 """Exit code of a process that `faulthandler.dump_traceback_later` has ended at the limit of time."""
+SAFE_PATH, OURS = "PYTHONSAFEPATH", "samplers"
+"""Variable of the environment by which Python leaves the working directory out, and its value where it is set here."""
 PARENT_SECONDS = 1.0
 """Time [s] between two looks of a worker whether its driver is still there."""
 
@@ -58,6 +62,26 @@ _loaded: OrderedDict[str, Work] = OrderedDict()
 def name_process() -> tuple[str, int]:
     """Return the name of this process: numbers of processes repeat from one machine to the next."""
     return _PROGRAM, os.getpid()
+
+
+@contextmanager
+def starting_processes() -> Iterator[None]:
+    """Let a Python that is started meanwhile not look for modules in the working directory (from 3.11 on).
+
+    It would do so before it looks anywhere else, and the folder may be somebody else's; see `begin_as_ever`.
+    """
+    mine = os.environ.setdefault(SAFE_PATH, OURS) == OURS
+    try:
+        yield
+    finally:
+        if mine:
+            os.environ.pop(SAFE_PATH, None)
+
+
+def begin_as_ever() -> None:
+    """Let what this process starts find its modules as ever: what an ego starts, say."""
+    if os.environ.get(SAFE_PATH) == OURS:
+        del os.environ[SAFE_PATH]
 
 
 def compute_in_worker(

@@ -157,7 +157,9 @@ class ProcessLink(ServerLink):
         self._folder = tempfile.mkdtemp(prefix="rare-envs-")
         address = f"ipc://{self._folder}/ego"
         socket.bind(address)
-        words = [sys.executable, "-m", "agents.remote.server", address, self._arguments]
+        # not -m, which finds modules in the working directory first: it may be somebody else's folder
+        code = f"import sys; sys.path[:] = {sys.path!r}; from agents.remote.server import main; main(*sys.argv[1:])"
+        words = [sys.executable, "-c", code, address, self._arguments]
         # an ego may print: to standard error, because standard output is for answers
         self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=2)
 

@@ -1,6 +1,6 @@
 """Server of an ego: a request in, an answer out, over ZeroMQ. See docs/egos.md.
 
-`python -m agents.remote.server ADDRESS ARGUMENTS`, those of `agents.load_ego` as JSON, answers for `process:EGO`.
+`main` answers for `process:EGO`, with the arguments of `agents.load_ego` as JSON.
 """
 
 from __future__ import annotations
@@ -301,7 +301,3 @@ def _load_handler(arguments: str) -> Callable[[bytes, bytes], bytes]:
         refusal = {"type": "error", "code": "ego", "reason": str(error), "id": None}
         return lambda connection, content: protocol.pack(refusal)
     return RequestHandler(ego).handle
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -13,11 +13,12 @@ import inspect
 import math
 import os
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from rare_envs.files import refuse_folder, refuse_link
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.registry import find_scenario, split_layout
 
@@ -92,17 +93,27 @@ def as_bad_input(*kinds: type[BaseException]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def output_folder(path: Path) -> Iterator[None]:
-    """Make the folder for results before the work, so that no run ends without a place to write to."""
-    new = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
+def output_folder(path: Path, *files: str, folders: Iterable[str] = ()) -> Iterator[None]:
+    """Make the folder for results, and folders in it, before the work, so that no run ends without a place to write to.
+
+    Folders in the way of its files are refused, and links in the place of those folders.
+    """
+    inside = [path / name for name in folders]
+    new = [folder for folder in (*inside, path, *path.parents) if not os.path.exists(folder)]
     try:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            reason = "there is a file of that name" if os.path.isfile(path) else error.strerror
-            raise BadInput(f"Cannot make the folder {str(path)!r}: {reason}.") from error
-        if not os.access(path, os.W_OK):
-            raise BadInput(f"Cannot write to the folder {str(path)!r}.")
+        with as_bad_input(ValueError):
+            for folder in inside:
+                refuse_link(folder)
+            for file in files:
+                refuse_folder(path / file)
+        for folder in (path, *inside):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                reason = "there is a file of that name" if os.path.isfile(folder) else error.strerror
+                raise BadInput(f"Cannot make the folder {str(folder)!r}: {reason}.") from error
+            if not os.access(folder, os.W_OK):
+                raise BadInput(f"Cannot write to the folder {str(folder)!r}.")
         yield
     except BaseException:
         for folder in new:  # the innermost first
@@ -114,9 +125,7 @@ def output_folder(path: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def output_file(path: Path | None) -> Iterator[None]:
     """Make the folder of a file before the work, as `output_folder` does; None where there is none to write."""
-    if path is not None and path.is_dir():
-        raise BadInput(f"Expected a file to write, got the folder {str(path)!r}.")
-    with contextlib.nullcontext() if path is None else output_folder(path.parent):
+    with contextlib.nullcontext() if path is None else output_folder(path.parent, path.name):
         yield
 
 

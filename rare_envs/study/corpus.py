@@ -144,9 +144,9 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
     return found
 
 
-def list_failures(run: LoadedStudy, trust: bool = False) -> list[StoredFailure]:
-    """Return the failures of a run, the most likely first; nothing is simulated and no ego is loaded."""
-    question, table = open_run(run, trust), run.failures
+def list_failures(run: LoadedStudy, trust: bool = False, **given: Any) -> list[StoredFailure]:
+    """Return the failures of a run, the most likely first; no ego is loaded. `given` is as for `open_question`."""
+    question, table = replace(open_run(run, trust, **given), ego=read_question(run.question).ego), run.failures
     names = [name for name in table if name not in ("f", "log_p0", *CRASH)]
     if not names or not all(np.isfinite(table[name]).all() for name in names):
         raise BadInput(f"The files of failures in {str(run.folder)!r} are damaged: a parameter is no number.")

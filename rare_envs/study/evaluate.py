@@ -34,7 +34,7 @@ from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures
 from rare_envs.study.question import Study, build_problem, digest_files, find_changed_files, open_question, prepare
 from rare_envs.study.report import Repeatability, Report, find_frequency
-from rare_envs.study.run_folder import STUDY
+from rare_envs.study.run_folder import BLOCKS, FAILURES, RESULT_FILES, STUDY
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
@@ -253,7 +253,7 @@ def run_into(
     study = settle_chunk(study, executor)
     part = part and not study.ego_was_given
     begin = partial(writing.begin_journal, folder, study.question, force, go_on=part)
-    with output_folder(folder), contextlib.closing(begin()) as journal:
+    with output_folder(folder, *RESULT_FILES), contextlib.closing(begin()) as journal:
         if journal.has_simulations:
             writing.note_resumption(folder, journal.earlier_seconds)
         else:
@@ -273,11 +273,12 @@ def resume(
 ) -> Report:
     """Continue an interrupted run; the answer is that of an undisturbed one."""
     journal, question = writing.continue_journal(folder, mend)
-    with contextlib.closing(journal):
-        question = replace(open_question(asdict(question), folder, trust), core=question.core, device=question.device)
+    with contextlib.closing(journal), output_folder(folder, *RESULT_FILES):
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
-        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
+        given = {name: value for name, value in (("ego", ego), ("on_error", on_error)) if value}
+        given |= {"core": question.core, "device": question.device}
+        question = open_question(asdict(question), folder, trust, **given)
         changed = find_changed_files(journal.head.get("files") or {}, digest_files(question))
         if changed:
             raise BadInput(
@@ -359,7 +360,7 @@ def compare_egos(
     for name, evaluator in evaluators.items():
         evaluator.watchers.append(kept[name].keep)
     asked: dict[str, Any] = {name: getattr(question, name) for name in ("gamma", "seed", "max_sim", "ensemble_run")}
-    with contextlib.nullcontext() if out is None else output_folder(out):
+    with contextlib.nullcontext() if out is None else output_folder(out, COMPARISON, FAILURES, BLOCKS):
         try:
             with as_bad_input(ValueError, EgoGone):
                 method = studies["A"].method

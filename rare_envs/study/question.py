@@ -1,9 +1,10 @@
 """Study: a question with everything that it names, checked and loaded before the first simulation; and trust in it.
 
-A run's question may name code: an ego or a measure `module:name`, an environment that a module registers. Whoever asks
-the question means that code. Whoever replays or resumes a folder that came from elsewhere does not, and modules are
-found in the working directory, where such a folder may bring its own. So each run that is made here is noted, and a
-folder whose question is not among these runs no code without trust. Files that a question names have digests.
+A run's question may name code: an ego or a measure `module:name`, an environment that a module registers; or an ego in
+another program or on the Hub. Whoever asks the question means these. Whoever replays or resumes a folder that came from
+elsewhere does not, and modules are found in the working directory, where such a folder may bring its own. So each run
+that is made here is noted, and a folder whose question is not among these runs no code and connects to nobody without
+trust. Files that a question names have digests.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ import torch
 
 import agents
 import samplers
-from agents.loading import find_ego_kind, strip_prefixes
+from agents.loading import find_ego_kind, names_function, strip_prefixes
 from agents.saved_ego import HUB_PREFIX, find_hub_model, find_statistics
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
@@ -49,7 +51,7 @@ MAX_NOTES = 2**24
 def note_question(question: Question) -> None:
     """Note that a question was asked here, so that its folder needs no trust; its code may change and is one's own."""
     digest = _digest_code(question)
-    if list_code(question) and digest not in _read_notes():
+    if list_risks(question) and digest not in _read_notes():
         with contextlib.suppress(OSError):  # a folder that cannot be written to makes the next replay ask
             find_notes().parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with find_notes().open("a", encoding="ascii") as file:
@@ -58,19 +60,19 @@ def note_question(question: Question) -> None:
 
 def find_module_file(name: str) -> Path | None:
     """Return the file of the module in `module:name`, found without running anything; None if there is none."""
-    parts = name.partition(":")[0].split(".")
-    for folder in (os.getcwd(), *sys.path):
-        base = Path(folder, *parts)
-        for path in (base / "__init__.py", base.with_name(f"{base.name}.py")):
-            with contextlib.suppress(OSError, ValueError):
-                if path.is_file():
-                    return path.resolve()
-    return None
+    places, spec = [os.getcwd(), *sys.path], None
+    parts = [] if find_ego_kind(name) in ELSEWHERE else name.partition(":")[0].split(".")
+    for last in range(len(parts)):  # a package first, as it runs first
+        spec = PathFinder.find_spec(".".join(parts[: last + 1]), places)
+        if spec is None:
+            return None
+        places = list(spec.submodule_search_locations or ())
+    return None if spec is None or spec.origin is None else Path(spec.origin).resolve()
 
 
 def _digest_code(question: Question) -> str:
     """Return what identifies a question and the places of its code."""
-    code = [[name, str(find_module_file(name))] for name in list_code(question)]
+    code = [[name, str(find_module_file(name))] for name in list_risks(question).values()]
     return hashlib.sha256(json.dumps([_keep_asked(question), code], sort_keys=True).encode()).hexdigest()
 
 
@@ -88,6 +90,8 @@ def _read_notes() -> set[str]:
 
 MAX_TEXT = 2**16
 """Letters of a name or formula in a question."""
+ELSEWHERE = ("remote", "hub")
+"""Kinds of egos that a connection is made for."""
 PROBLEM_FIELDS = (
     *("measure", "noise", "drivers", "horizon", "collisions", "observation", "weather", "action", "core", "device"),
 )
@@ -276,23 +280,29 @@ def read_about(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def open_run(study: LoadedStudy, trust: bool) -> Question:
+def open_run(study: LoadedStudy, trust: bool, **given: Any) -> Question:
     """Return the question of a finished run, see `open_question`."""
-    return open_question(study.result.get("question"), study.folder, trust)
+    return open_question(study.result.get("question"), study.folder, trust, **given)
 
 
-def open_question(recorded: object, folder: Path, trust: bool) -> Question:
-    """Return the question of a folder, if its values are of the right types and what code it names may run."""
-    question = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
+def open_question(recorded: object, folder: Path, trust: bool, **given: Any) -> Question:
+    """Return the question of a folder as it will be used, with what its reader gives in the place of what it has.
+
+    A BadInput says that a value is of a wrong type, or that what the folder names may not be used without trust.
+    """
+    asked = replace(read_question(recorded), trust=trust, core="auto", device="cpu")
+    question = replace(asked, **given)
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
         raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
-    code = list_code(question)
-    if code and not trust and _digest_code(question) not in _read_notes():
-        files = {name: find_module_file(name) for name in code}
+    risks = [name for field, name in list_risks(question).items() if field not in given]
+    if risks and not trust and _digest_code(asked) not in _read_notes():
+        files = {name: find_module_file(name) for name in risks}
         named = ", ".join(f"{name!r}{f' ({path})' if path else ''}" for name, path in files.items())
+        elsewhere = {find_ego_kind(name) in ELSEWHERE for name in risks}
+        does = " and ".join("connects to another program" if each else "runs code" for each in sorted(elsewhere))
         raise BadInput(
-            f"The run in {str(folder)!r} was not made here, and its question runs code: {named}. Look at that code, "
-            "then add --trust (trust=True)."
+            f"The run in {str(folder)!r} was not made here, and its question {does}: {named}. Look at that, then add "
+            "--trust (trust=True)."
         )
     return question
 
@@ -305,12 +315,13 @@ def is_same_question(recorded: object, question: Question) -> bool:
     return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
 
 
-def list_code(question: Question) -> list[str]:
-    """Return the code that a question names, as `module:name`."""
+def list_risks(question: Question) -> dict[str, str]:
+    """Return code that a question names, as `module:name`, and an ego elsewhere, by field."""
     ego, measure, env_id = strip_prefixes(question.ego), question.measure, question.env_id
-    found = [ego] if find_ego_kind(ego) == "function" else []
-    found += [measure] if ":" in measure and not measure.startswith("stl:") else []
-    return found + ([env_id] if ":" in env_id else [])
+    # whether or not there is a file of that name at the moment: it may be gone when the ego is loaded
+    found = {"ego": ego} if find_ego_kind(ego) in ELSEWHERE or names_function(ego) else {}
+    found |= {"measure": measure} if ":" in measure and not measure.startswith("stl:") else {}
+    return found | ({"env_id": env_id} if ":" in env_id else {})
 
 
 def _keep_asked(question: Question) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from rare_envs.measures import Moment
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import drive
-from rare_envs.study.arguments import BadInput, as_bad_input
+from rare_envs.study.arguments import BadInput, as_bad_input, read_question
 from rare_envs.study.episodes import MAX_SHOWN, format_value
 from rare_envs.study.question import open_run, prepare, warn_of_changed_files
 from rare_envs.study.run_folder import FAILURES, load_finished
@@ -163,14 +163,13 @@ class RecordedFailure(NamedTuple):
 def find_failure(folder: Path, number: int, trust: bool = False, ego: str | None = None) -> RecordedFailure:
     """Return failure `number` of a run, 0 being the most likely; with another ego in its world, if one is named."""
     run = load_finished(folder)
-    question, table, count = open_run(run, trust), run.failures, len(run.failures["f"])
-    warn_of_changed_files(question, folder)
+    given = {} if ego is None else {"ego": ego, **dict.fromkeys(("algo", "stats", "observation", "action"))}
+    question, table, count = open_run(run, trust, **given), run.failures, len(run.failures["f"])
+    warn_of_changed_files(read_question(run.question), folder)
     if not count:
         raise BadInput("The run has no failure.")
     if not 0 <= number < count:
         raise BadInput(f"Expected a failure from 0 to {count - 1}, got {number}.")
-    if ego is not None:
-        question = replace(question, ego=ego, algo=None, stats=None, observation=None, action=None)
     with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
         problem = prepare(question).problem
     x, found = read_row(table, problem, number), run.result.get("n_failures")

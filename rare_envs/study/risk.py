@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +24,7 @@ from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.startup import __version__
 from rare_envs.study import text
-from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer
+from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
@@ -34,8 +35,8 @@ from rare_envs.study.writing import check_no_results
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
-RISK = "risk.json"
-"""Numbers of a risk, the last file that is written."""
+RISK, PICTURE = "risk.json", "risk.png"
+"""Numbers of a risk, the last file that is written, and their picture."""
 TWICE = ("cut_in", "car_following")
 """Scenarios of which a set may have one: a cut-in gives the ego a new leader, so that car-following behind new leaders
 contains the cut-ins."""
@@ -312,23 +313,26 @@ def risk(
         studies = [prepare(question, None if named else ego) for question in fitting.values()]
         for study in studies:
             find_frequency(study)
-    if folder is not None and not force:  # all of them, before the first one is run
-        check_no_results(folder, RISK)
-        for part in (folder / name for name in fitting if not (folder / name / JOURNAL).exists()):
-            check_no_results(part)
-    done: list[ScenarioRisk] = []
-    for study in studies:
-        try:
-            done.append(_evaluate(study, sites[1:], folder, progress, force))
-        except RunInterrupted as error:
-            known = "; ".join(f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done)
-            raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
-    found = Risk(ego=ego_name, scenarios=tuple(done), left_out=left_out)
-    if folder is not None:
-        found.save_plot(folder / "risk.png")
-        replace_text(folder / RISK, format_json(found.to_dict()) + "\n")
-        for name in fitting:
-            (folder / name / JOURNAL).unlink(missing_ok=True)
+    with contextlib.nullcontext() if folder is None else output_folder(folder, RISK, PICTURE, folders=fitting):
+        if folder is not None and not force:  # all of them, before the first one is run
+            check_no_results(folder, RISK)
+            for part in (folder / name for name in fitting if not (folder / name / JOURNAL).exists()):
+                check_no_results(part)
+        done: list[ScenarioRisk] = []
+        for study in studies:
+            try:
+                done.append(_evaluate(study, sites[1:], folder, progress, force))
+            except RunInterrupted as error:
+                known = "; ".join(
+                    f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done
+                )
+                raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
+        found = Risk(ego=ego_name, scenarios=tuple(done), left_out=left_out)
+        if folder is not None:
+            found.save_plot(folder / PICTURE)
+            replace_text(folder / RISK, format_json(found.to_dict()) + "\n")
+            for name in fitting:
+                (folder / name / JOURNAL).unlink(missing_ok=True)
     return found
 
 

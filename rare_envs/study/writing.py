@@ -112,7 +112,8 @@ def _remove_drafts(folder: Path) -> None:
     """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
     for name in map(Path, run_folder.RESULT_FILES):
         for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
-            draft.unlink(missing_ok=True)
+            with suppress(OSError):  # a folder of that name is none
+                draft.unlink()
 
 
 def write_run(folder: Path, report: Report) -> None:

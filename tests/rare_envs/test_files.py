@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.files import MAX_TEXT_BYTES, read_text_file, replace_file
+from rare_envs.files import MAX_TEXT_BYTES, read_text_file, replace_file, replace_text
 
 
 def names(folder: Path) -> list[str]:
@@ -27,6 +27,29 @@ def test_an_error_leaves_the_earlier_file_and_no_draft(error: type[BaseException
         raise error
     assert path.read_bytes() == b"earlier"
     assert names(tmp_path) == ["ego.zip"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs links")
+def test_what_is_written_replaces_links_and_gives_nobody_more_rights(tmp_path: Path) -> None:
+    outside, path = tmp_path / "outside", tmp_path / "report.html"
+    outside.write_text("precious")
+    (tmp_path / "folder").mkdir()
+    path.hardlink_to(outside)
+    for target in (outside, tmp_path / "nowhere", tmp_path / "folder"):
+        replace_text(path, "new")
+        assert path.read_text() == "new" and not path.is_symlink() and outside.read_text() == "precious"
+        path.unlink()
+        path.symlink_to(target)
+    replace_text(path, "new")
+    for before, after in ((0o600, 0o600), (0o6777, 0o644)):
+        path.chmod(before)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(tmp_path)
+            umask = os.umask(0o022)
+            replace_text("report.html", "again")
+            os.umask(umask)
+        assert path.stat().st_mode & 0o7777 == after
+    assert names(tmp_path) == ["folder", "outside", "report.html"] and not names(tmp_path / "folder")
 
 
 WRITER = """

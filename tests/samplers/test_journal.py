@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import sqlite3
 import sys
 import time
@@ -208,6 +209,41 @@ def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
         connection.close()
         with pytest.raises(JournalError, match="is no journal"):
             Journal.open(tmp_path / "k")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs links")
+@pytest.mark.parametrize("end", ["", "-wal", "-journal", "-shm"])
+def test_nothing_is_written_through_a_journal_that_is_elsewhere_too(end: str, tmp_path: Path) -> None:
+    path, beside, other = tmp_path / "journal", tmp_path / f"journal{end}", tmp_path / "other"
+    Journal.create(path, {}).close()
+    other.write_bytes(path.read_bytes())
+    before = other.read_bytes()
+    for put in (beside.symlink_to, beside.hardlink_to):
+        beside.unlink(missing_ok=True)
+        put(other)
+        for mend in (False, True):
+            with pytest.raises(JournalError, match=r"has another name too, .* put a copy in its place"):
+                Journal.open(path, mend)
+        with pytest.raises(JournalError, match="There is a journal already"):
+            Journal.create(path, {})
+    Journal.create(path, {}, replace=True).close()
+    assert other.read_bytes() == before and not path.is_symlink()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE TRIGGER t AFTER INSERT ON chunks BEGIN DELETE FROM chunks WHERE id < 2; END",
+        "ALTER TABLE chunks RENAME TO kept; CREATE VIEW chunks AS WITH RECURSIVE c(id) AS "
+        "(SELECT 0 UNION ALL SELECT id + 1 FROM c) SELECT *, 0, 0, 0, 0, 0, 0, 0 FROM c WHERE id < 0",
+    ],
+)
+def test_a_database_that_does_more_than_hold_records_is_no_journal(statement: str, tmp_path: Path) -> None:
+    Journal.create(tmp_path / "journal", {}).close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "journal")) as connection:
+        connection.executescript(statement)
+    with pytest.raises(JournalError, match="of another kind"):
+        Journal.open(tmp_path / "journal")
 
 
 def test_creating_replaces_an_empty_journal_alone_and_one_process_has_it(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rare_envs.study.arguments import (
     ExecutorOptions,
     Question,
     as_bad_input,
-    output_folder,
+    output_file,
     read_question_file,
 )
 from rare_envs.study.cli import shell
@@ -122,16 +122,16 @@ def estimate_highway_env(question: Question, out: Path | None, force: bool, exec
         problem = rare_envs.highway_env_problem(
             question.env_id, ego, measure=question.measure, noise=question.noise, fixed="highway_env", **settings
         )
-        try:
-            result = samplers.estimate(problem, method, progress=True, executor=executor, **arguments)
-        except samplers.EstimationInterrupted as stopped:
-            known = _describe(question, problem, stopped.estimate, None)
-            raise RunInterrupted(describe_stop(stopped.estimate), known) from None
-        except KeyboardInterrupt:
-            raise RunInterrupted(FIRST_BATCH) from None
-    if file is not None:
-        with output_folder(file.parent):
-            result.save(file)
+        with output_file(file):
+            try:
+                result = samplers.estimate(problem, method, progress=True, executor=executor, **arguments)
+            except samplers.EstimationInterrupted as stopped:
+                known = _describe(question, problem, stopped.estimate, None)
+                raise RunInterrupted(describe_stop(stopped.estimate), known) from None
+            except KeyboardInterrupt:
+                raise RunInterrupted(FIRST_BATCH) from None
+            if file is not None:
+                result.save(file)
     return _describe(question, problem, result, out)
 
 

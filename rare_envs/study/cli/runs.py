@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
+from rare_envs.files import refuse_link
 from rare_envs.study.arguments import BadInput, as_bad_input, output_file
 from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, RunArgument, command
 
@@ -47,12 +48,16 @@ def report_command(
 def corpus_add_command(
     run: RunArgument,
     asked: dict[str, Any],
+    typed: set[str],
     corpus: CorpusOption = Path("corpus"),
     most: Annotated[int, Option(help="Failures to add: the most likely, and one of each kind of crash.")] = 20,
 ) -> Answer:
     """Add the failures of a run to a corpus, a file each, named by what is in it."""
     from rare_envs.study.corpus import add_run
 
+    if "corpus" not in typed:  # the working directory may be somebody else's
+        with as_bad_input(ValueError):
+            refuse_link(corpus)
     chosen, new = add_run(run, corpus, most, **asked)
     text = f"Added {new} of {len(chosen)} failures to {corpus}{'' if new else '; it had all of them'}."
     return Answer({"corpus": str(corpus), "added": new, "failures": [each.key for each in chosen]}, text)
@@ -83,7 +88,7 @@ def replay_all(folder: Path, ego: str | None, trust: bool) -> Answer:
     from rare_envs.study.run_folder import load_finished
 
     start, run = time.perf_counter(), load_finished(folder)
-    failures = list_failures(run, trust)
+    failures = list_failures(run, trust, **({} if ego is None else {"ego": ego}))
     if not failures:
         raise BadInput(f"The run in {str(folder)!r} has no failure.")
     if ego is not None:

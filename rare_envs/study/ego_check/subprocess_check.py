@@ -33,6 +33,7 @@ from rare_envs.study.arguments import BadInput, Question, as_bad_input
 from rare_envs.study.ego_check import Finding
 from rare_envs.study.ego_check.checks import EGO_CHECKS, Probe
 from rare_envs.study.question import build_problem
+from samplers.workers import begin_as_ever, starting_processes
 
 START_TIMEOUT, COMPILING_TIMEOUT = 60.0, 600.0
 """Durations that the process may take before its first check, and for compiling rollouts [s]."""
@@ -71,7 +72,8 @@ def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Find
     context = get_context("loky")  # the main script is not run again, as it is by multiprocessing
     received, sent = context.Pipe(duplex=False)
     process = context.Process(target=_send_findings, args=(question, sent))
-    process.start()
+    with starting_processes():
+        process.start()
     sent.close()  # so that its end is noticed
     doing, limit = "loading", max(START_TIMEOUT, time_limit)
     try:
@@ -97,6 +99,7 @@ def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Find
 
 def _send_findings(question: Question, to: Connection) -> None:
     """Run the checks in that process: send each finding, before each check its name, and None at the end."""
+    begin_as_ever()
     os.dup2(2, 1)  # an ego may print
     with use_one_thread():
         for each in run_checks(question):

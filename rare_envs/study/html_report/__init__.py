@@ -23,7 +23,7 @@ from rare_envs.files import replace_text
 from rare_envs.plugins import EgoGone, one_line, reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import plots, text
-from rare_envs.study.arguments import BadInput, as_bad_input, output_file, output_folder
+from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
 from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.html_report import figures as drawings
 from rare_envs.study.html_report.figures import FigureOfPage
@@ -211,7 +211,7 @@ def write_html_report(
     if figures is not None and figures not in drawings.FORMATS:
         raise BadInput(f"Expected --figures {', '.join(drawings.FORMATS)}, got {figures!r}.")
     study, page = load_finished(folder), out or folder / REPORT
-    with output_file(page):
+    with output_folder(page.parent, page.name, folders=() if figures is None else ("figures",)):
         question = open_run(study, trust)
         warn_of_changed_files(question, folder)
         problem = prepare(question).problem
@@ -225,8 +225,7 @@ def write_html_report(
             if figures is None:
                 return [page]
             every = [*drawn.values(), *(figure for entry in atlas for figure in entry.figures)]
-            with output_folder(page.parent / "figures"):
-                return [page, *(figure.save(page.parent / "figures", figures) for figure in every)]
+            return [page, *(figure.save(page.parent / "figures", figures) for figure in every)]
 
 
 def render_page(

@@ -8,13 +8,24 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import agents
 from rare_envs.study import BadInput, Question, prepare, run_into
+from rare_envs.study.arguments import read_question
 from rare_envs.study.evaluate import resume
-from rare_envs.study.question import digest_files, find_changed_files, is_same_question, list_code, open_question
+from rare_envs.study.html_report import write_html_report
+from rare_envs.study.question import (
+    digest_files,
+    find_changed_files,
+    is_same_question,
+    list_risks,
+    note_question,
+    open_question,
+)
 from rare_envs.study.replay import find_failure
-from rare_envs.study.run_folder import RESULT
+from rare_envs.study.run_folder import EPISODES, FAILURES, PLOT, RESULT, RESULT_FILES, STUDY, load_study
 from rare_envs.study.writing import begin_journal
 from tests.rare_envs.study.refusals import FOLLOWING
 
@@ -43,6 +54,8 @@ CODE = {
     "ego behind a stack and in a process": {"ego": "noisy:process:evil:make?timeout=5"},
     "measure": {"measure": "evil:gap"},
     "environment": {"env_id": f"evil:{FOLLOWING}"},
+    "a program elsewhere": {"ego": "noisy:tcp://127.0.0.1:9?timeout=1"},
+    "the Hub": {"ego": "process:hf:user/ppo"},
 }
 
 
@@ -77,7 +90,8 @@ def test_a_received_run_is_neither_replayed_nor_resumed_without_trust(name: str,
     Path("begun").mkdir()
     begin_journal(Path("begun"), question).close()
     for act in (lambda: find_failure(received, 0), lambda: resume(Path("begun"))):
-        with pytest.raises(BadInput, match=r"was not made here, and its question runs code: 'evil:.*add --trust"):
+        words = r"was not made here, and its question (runs code: 'evil:|connects to .*: '(tcp|hf):).*add --trust"
+        with pytest.raises(BadInput, match=words):
             act()
     assert not Path("was_here").exists()
 
@@ -105,6 +119,63 @@ def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path, monkey
         find_failure(tmp_path / "mine", 0)
 
 
+def test_an_ego_of_the_readers_own_is_asked_no_trust_but_the_rest_of_the_question_is(received: Path) -> None:
+    change_question(received, ego="tcp://127.0.0.1:9")
+    assert find_failure(received, 0, ego="idm").n_found > 0
+    change_question(received, measure="evil:gap")
+    with pytest.raises(BadInput, match=r"runs code: 'evil:gap' \("):
+        find_failure(received, 0, ego="idm")
+
+
+def test_modules_of_ones_own_get_nothing_from_somebody_elses_folder(
+    received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, theirs = tmp_path / "own", tmp_path / "theirs"
+    for folder, content in ((own / "kept", ""), (theirs / "kept", EVIL)):
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").write_text(content)
+    (own / "kept" / "egos.py").write_text(EVIL.replace('Path("was_here").touch()', "import helper"))
+    (own / "helper.py").touch()
+    (theirs / "helper.py").write_text(EVIL)
+    monkeypatch.syspath_prepend(str(own))
+    question = Question(env_id=FOLLOWING, ego="kept.egos:make", base="us101-gap", method="mc", max_sim=200, gamma=5.0)
+    note_question(question)
+    change_question(received, **asdict(question))
+    monkeypatch.chdir(theirs)
+    with pytest.raises(BadInput, match="runs code"):  # the package there would be imported first
+        find_failure(received, 0)
+    shutil.rmtree("kept")
+    open_question(asdict(question), received, trust=False)
+    agents.load_ego(question.ego)
+    assert not Path("was_here").exists()
+
+
+@pytest.mark.slow
+def test_the_process_of_an_ego_finds_no_modules_in_the_working_directory(received: Path) -> None:
+    for name in ("zmq.py", "agents.py"):
+        Path(name).write_text(EVIL)
+    ego: Any = agents.load_ego("process:imitation")
+    assert ego.predict(np.zeros((1, 51), np.float32))[0].shape == (1, 2)
+    assert not Path("was_here").exists()
+
+
+def test_nothing_is_written_through_the_links_of_a_folder(received: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    (outside / "figures").mkdir(parents=True)
+    (outside / "precious").write_text("precious")
+    (tmp_path / "half").mkdir()
+    begin_journal(tmp_path / "half", replace(read_question(load_study(received).question), max_sim=100)).close()
+    for name in RESULT_FILES:
+        (tmp_path / "half" / name).symlink_to(outside / "precious")
+    resume(tmp_path / "half")
+    assert (outside / "precious").read_text() == "precious"
+    assert not any((tmp_path / "half" / name).is_symlink() for name in (RESULT, FAILURES, EPISODES, STUDY, PLOT))
+    (received / "figures").symlink_to(outside / "figures")
+    with pytest.raises(BadInput, match="figures' is a link, and nothing is written through one: remove it"):
+        write_html_report(received, figures="svg")
+    assert not any((outside / "figures").iterdir())
+
+
 @pytest.mark.filterwarnings("ignore:.*changed since the run")  # a base in the place of a file
 def test_odd_questions_are_refused_in_one_line(received: Path) -> None:
     for change, words in (
@@ -127,8 +198,9 @@ def test_values_of_every_field_are_taken_back_and_what_is_no_code_is_not_listed(
     question = Question(env_id=FOLLOWING, gamma=1, max_sim=None, noise="fixed", horizon=3.0, trust=True)
     recorded = json.loads(json.dumps(asdict(question)))
     assert open_question({**recorded, "unknown": 1}, received, trust=True) == question
-    for ego in ("idm", "ego.zip", "noisy:gail", "tcp://127.0.0.1:5555", "process:imitation?timeout=3"):
-        assert list_code(Question(env_id=FOLLOWING, ego=ego)) == []
+    Path("evil:make").touch()  # which need not be there when the ego is loaded
+    for ego in ("idm", "ego.zip", "noisy:gail", "human:no-headway-rule", "process:imitation?timeout=3", "evil:make"):
+        assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == ({"ego": ego} if ego == "evil:make" else {})
 
 
 @pytest.mark.parametrize("name", ["vecnormalize.pkl", "mine.pkl"])
