@@ -457,7 +457,8 @@ class _LocalProcess:
         import loky
 
         begin = functools.partial(_begin_process, os.getpid())
-        self._executor = loky.ProcessPoolExecutor(1, initializer=begin, env=ENVIRONMENT)
+        with starting_processes():  # of loky's own
+            self._executor = loky.ProcessPoolExecutor(1, initializer=begin, env=ENVIRONMENT)
         self._numbers: set[int] = set()
 
     def submit(self, function: Any, *arguments: Any) -> Any:

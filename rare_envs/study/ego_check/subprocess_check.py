@@ -70,9 +70,9 @@ def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
 def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Finding]:
     """Yield the findings of a process that is started anew, and a failure if it hangs or dies."""
     context = get_context("loky")  # the main script is not run again, as it is by multiprocessing
-    received, sent = context.Pipe(duplex=False)
-    process = context.Process(target=_send_findings, args=(question, sent))
     with starting_processes():
+        received, sent = context.Pipe(duplex=False)
+        process = context.Process(target=_send_findings, args=(question, sent))
         process.start()
     sent.close()  # so that its end is noticed
     doing, limit = "loading", max(START_TIMEOUT, time_limit)
