@@ -90,7 +90,7 @@ def _stratum_means(values: FloatArray, strata: NDArray[np.int64]) -> FloatArray:
 
 LOW_ESS = 30
 """Effective failing draws below which the normal approximation of the interval is not relied on."""
-COARSE_ESS = 20
+COARSE_ESS = 10
 """Effective failing draws below which there is a warning: 2.0 % of right runs had one, and 17 of 54 wrong ones (67
 limit states); from 30 on 3.5 % and 19."""
 

@@ -322,7 +322,7 @@ def find_regions(
     wide_u = first.u[n_base:][first.f[n_base:] <= gamma]
     density = mixture_log_ratio(log_ratios(first.components[1:], wide_u), first.counts[1:].astype(np.float64))
     roots = len(np.union1d(descent.roots, line_roots))
-    discovery = Discovery(count_lineages(roots, -density), descent.ceiling)
+    discovery = Discovery(count_lineages(roots, -density), ceiling=descent.ceiling)
     most = max(2, (sizes.limit - simulator.n_sim) // CHAIN_COST)
     nearest, n_far = np.argsort((wide_u**2).sum(axis=1), kind="stable"), min(sizes.starts, most)
     others = rng.permutation(nearest[n_far // 2 :])[: n_far - n_far // 2]  # no region that was met is left out by rule
@@ -345,7 +345,7 @@ def find_regions(
     result = yield from grow_regions(simulator, starts, gamma, sizes.limit, rng)
     if len(result.regions) == 1 and not result.noisy:
         result = result._replace(regions=[_add_levels(result.regions[0], descent)])
-    return result._replace(levels=descent.levels, discovery=discovery)
+    return result._replace(levels=descent.levels, discovery=discovery._replace(regions=len(result.regions)))
 
 
 def _add_levels(region: Region, descent: SubsetPoints) -> Region:

@@ -29,7 +29,7 @@ from samplers.methods.two_stage.refinement import (
     start_refinement,
     typical_weights,
 )
-from samplers.methods.two_stage.regions import ExplorationResult, discovery_interval, is_noisy
+from samplers.methods.two_stage.regions import ExplorationResult, is_noisy, sampling_interval
 from samplers.methods.two_stage.settings import BUDGET, EXPLORATION, FALLBACK, PROPOSAL
 from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
@@ -40,7 +40,7 @@ from samplers.methods.two_stage.stratified import (
     check_rounds,
 )
 from samplers.problem import FloatArray, Inputs, check_settings
-from samplers.sample import DrawWeights, Interval, Sample, Status, binomial_cov, effective_sample_size
+from samplers.sample import DrawWeights, Interval, Sample, Status, add_unseen, binomial_cov, effective_sample_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,15 +78,15 @@ class TwoStage(Method):
     share M of p in regions that were not found:
 
         upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/10, nu)
-        nu = distinct base draws whose line or path of levels failed + max(ESS, hits / 4) of the wide draws
+        nu = (distinct base draws whose line or path of levels failed + max(ESS, hits / 4) of the wide draws) / regions
 
-    nu independent lineages all led to known regions; a region of share M would be missed by one with probability
-    1 - M. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25, 0.005 for 200. The c.o.v. is that of the sampling
-    alone.
+    Independent searches all led to known regions; a region of share M would be missed by one with probability 1 - M,
+    and the more regions were met, the more are to be expected. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25,
+    0.005 for 200. The c.o.v. is that of the sampling alone.
 
     *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p
-    allows, rounds that contradict the estimate, regions that the last draws hardly reach, and a search of so few
-    lineages that M may exceed 0.3. A region that neither f announces nor any draw has hit gives no warning;
+    allows, rounds that contradict the estimate, regions that the last draws hardly reach, and an interval that is
+    mostly M, where this may exceed 0.5. A region that neither f announces nor any draw has hit gives no warning;
     `Estimate.unseen` bounds it.
 
     *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
@@ -200,7 +200,7 @@ def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Genera
     if budget >= BUDGET.sufficient:
         return outcome
     about = f"A search of {budget:,} simulations misses one of two like regions in up to 30 % of runs"
-    return replace(outcome, warnings=(*outcome.warnings, f"{about}; {BUDGET.sufficient:,} are recommended."))
+    return outcome.remark_first(f"{about}; {BUDGET.sufficient:,} are recommended.")
 
 
 def _draw_first(run: SearchRun, state: RunState) -> SimulationSteps[RunState]:
@@ -377,8 +377,9 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
         early = _estimate_early(run, state)
         return early if stopped else replace(early, status=Status.BUDGET)
     discovery = refinement.exploration.discovery
-    interval = discovery_interval(whole.draws, whole.cov, goal.confidence, whole.largest_weight, discovery)
-    outcome = _outcome(run, state, whole.draws, whole.cov, interval)
+    low, high = sampling_interval(whole.draws, whole.cov, goal.confidence, whole.largest_weight, discovery)
+    raised = add_unseen(whole.p, high, discovery.lineages, goal.confidence)
+    outcome = _outcome(run, state, whole.draws, whole.cov, (low, raised))
     points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
     parts = (*state.counted, (sample, run.simulator.n_sim - sample.draws.n))
     hits = int((state.base_f <= goal.gamma).sum())
@@ -386,7 +387,7 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
         *check_base_draws(whole.p, hits, len(state.base_f)),
         *check_rounds(sample, state.rounds),
         *check_regions(whole),
-        *check_discovery(whole.p, discovery, goal.confidence),
+        *check_discovery(whole.p, high, raised, discovery, goal.confidence),
     ]
     return replace(
         outcome,

@@ -246,14 +246,16 @@ def check_regions(final: StratifiedSample) -> list[str]:
     ]
 
 
-def check_discovery(p: float, discovery: Discovery, confidence: float) -> list[str]:
-    """Return a warning if so few lineages reached failure that much of p may be in regions that were not found."""
+def check_discovery(p: float, high: float, raised: float, discovery: Discovery, confidence: float) -> list[str]:
+    """Return a warning if more of p may be unseen than was found, and the interval is mostly what that adds to it.
+
+    `raised` is its upper end with the unseen share, `high` the one without.
+    """
     share = discovery.unseen_share(confidence)
-    if share <= DOUBT.max_unseen_share:
+    if share <= DOUBT.max_unseen_share or high * high > p * raised:
         return []
-    searches = f"{discovery.lineages:.0f}"
-    size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)" if p else "of unknown probability"
+    size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)"
     return [
-        f"Only {searches} independent search{'' if searches == '1' else 'es'} reached failure: further failure regions "
-        f"{size} cannot be excluded."
+        f"{discovery.searches:.0f} independent searches reached failure, in {discovery.regions} regions: further "
+        f"failure regions {size} cannot be excluded."
     ]
