@@ -383,7 +383,8 @@ def find_slopes(
     dim = simulator.inputs.dim
     short = exploration.scattered or dim > HIGH_DIM
     n = min(int(SLOPES.shares[short] * room / (dim + 1)), SLOPES.most)
-    if dim < SLOPES.min_dim or n < LEAST_SLOPES or exploration.noisy or not exploration.regions:
+    sought = any(len(exploration.regions) >= regions and dim >= least for regions, least in SLOPES.min_dims)
+    if not sought or n < LEAST_SLOPES or exploration.noisy:
         return None
     points = _collect_points(exploration, gamma, rng)
     first = max(n - n // 2, LEAST_SLOPES)
