@@ -65,8 +65,8 @@ class SLOPES:
     """Gradients of f by finite differences (`exploration.py`)."""
 
     min_dims = ((1, 15), (4, 10))
-    """(regions, dimensions) from which on they are sought: with fewer, chains show as much. Of many regions each has few
-    chains: with the second pair 4 of 60 runs on rare_d14 were off by more than 4 of their standard errors, else 17."""
+    """(regions, dimensions) from which on they are sought: with fewer, chains show as much. Many regions have few
+    chains each: with the second pair 4 of 60 runs on rare_d14 were off by more than 4 of their errors, else 17."""
     shares = (0.22, 0.3)
     """Share of what is left for them at most: 17 gradients in 40 dimensions. The second one above `HIGH_DIM`
     dimensions, and where the regions are pieces of something like a shell."""
