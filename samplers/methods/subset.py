@@ -6,6 +6,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from samplers.importance import COARSE_ESS
 from samplers.mcmc import (
     Chains,
     Growth,
@@ -117,12 +118,15 @@ def summarise(inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Leve
     cov, (low, high) = judge_levels(levels[-1], goal, trace)
     of_base = len(levels[0].where(levels[0].f <= goal.gamma).f)
     most = clopper_pearson(of_base, trace[0].n_points, goal.confidence)[1]
+    about = _describe_end(len(trace) - 1, status, len(hits))
+    enough = status is Status.BUDGET and len(hits) >= COARSE_ESS  # the interval says what fewer levels leave open
     return Outcome(
         p=p,
         interval=(low, max(p, min(high, most))),
         cov=cov,
         status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
-        warnings=(*_end_warnings(len(trace) - 1, status, len(hits)), *_chain_warnings(trace)),
+        warnings=(*(() if enough else about), *_chain_warnings(trace)),
+        remarks=tuple(about) if enough else (),
         trace=tuple(trace),
         no_outcome_share=no_outcome_share(hits),
         base_draws=trace[0].n_points,
@@ -152,8 +156,8 @@ def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], ga
     )
 
 
-def _end_warnings(depth: int, status: Status, hits: int) -> list[str]:
-    """Return what the end of the run at level `depth` and its failures leave doubtful."""
+def _describe_end(depth: int, status: Status, hits: int) -> list[str]:
+    """Return what the end of the run at level `depth` and its failures may leave doubtful."""
     failing = f"{hits} failing point{'' if hits == 1 else 's'}"
     about = {
         Status.STALLED: f"No progress beyond level {depth}: f is constant there, or the limit on levels was reached.",
