@@ -78,7 +78,7 @@ class TwoStage(Method):
     share M of p in regions that were not found:
 
         upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/10, nu)
-        nu = (distinct base draws whose line or path of levels failed + max(ESS, hits / 4) of the wide draws) / regions
+        nu = 2 (distinct base draws whose line or path failed + max(ESS, hits / 4) of the wide draws) / (1 + regions)
 
     Independent searches all led to known regions; a region of share M would be missed by one with probability 1 - M,
     and the more regions were met, the more are to be expected. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25,
@@ -86,7 +86,7 @@ class TwoStage(Method):
 
     *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p
     allows, rounds that contradict the estimate, regions that the last draws hardly reach, and an interval that is
-    mostly M, where this may exceed 0.5. A region that neither f announces nor any draw has hit gives no warning;
+    mostly M, where this may exceed 0.4. A region that neither f announces nor any draw has hit gives no warning;
     `Estimate.unseen` bounds it.
 
     *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
