@@ -91,8 +91,8 @@ def _stratum_means(values: FloatArray, strata: NDArray[np.int64]) -> FloatArray:
 LOW_ESS = 30
 """Effective failing draws below which the normal approximation of the interval is not relied on."""
 COARSE_ESS = 10
-"""Effective failing draws below which there is a warning: 2.0 % of right runs had one, and 17 of 54 wrong ones (67
-limit states); from 30 on 3.5 % and 19."""
+"""Effective failing draws below which there is a warning: at 1,500 simulations 38 of 455 right runs of two-stage had
+one, and 45 of 93 that were off by more than 4 errors (67 limit states); from 10 to 20 there were 31 and 7."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,12 +86,12 @@ def test_bernstein_bound_is_that_of_the_theorem():
 
 
 def test_doubts_are_of_few_and_of_heavy_draws():
-    assert "draws: 19;" in weight_warnings(equal(19))[0]
-    assert weight_warnings(equal(20)) == []
+    assert "draws: 9;" in weight_warnings(equal(9))[0]
+    assert weight_warnings(equal(10)) == []
     others = [1.0] * 100
-    assert weight_warnings(weighing(*others, 25.0)) == []  # 125^2 / 725 = 21.6
-    assert weight_warnings(weighing(*others, 30.0)) == [  # 130^2 / 1000
-        "Effective sample size of the failing draws: 17; the estimate is coarse."
+    assert weight_warnings(weighing(*others, 44.0)) == []  # 144^2 / 2036 = 10.2
+    assert weight_warnings(weighing(*others, 50.0)) == [  # 150^2 / 2600
+        "Effective sample size of the failing draws: 9; the estimate is coarse."
     ]
     assert "None of 1,000 final draws failed" in weight_warnings(weighing())[0]
 

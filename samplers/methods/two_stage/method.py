@@ -35,9 +35,9 @@ from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
     StratifiedSample,
     check_base_draws,
-    check_discovery,
     check_regions,
     check_rounds,
+    describe_discovery,
 )
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.sample import DrawWeights, Interval, Sample, Status, add_unseen, binomial_cov, effective_sample_size
@@ -85,9 +85,9 @@ class TwoStage(Method):
     0.005 for 200. The c.o.v. is that of the sampling alone.
 
     *Warnings* (`stratified.py`): uneven weights, base draws that fail more often than p
-    allows, rounds that contradict the estimate, regions that the last draws hardly reach, and an interval that is
-    mostly M, where this may exceed 0.4. A region that neither f announces nor any draw has hit gives no warning;
-    `Estimate.unseen` bounds it.
+    allows, rounds that contradict the estimate and regions that the last draws hardly reach. A region that neither f
+    announces nor any draw has hit gives no warning; `Estimate.unseen` bounds it. A remark says where the interval is
+    mostly M.
 
     *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
     Carlo), and where no mixture describes the failures (adaptive subset simulation in all coordinates): dozens of
@@ -387,11 +387,11 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
         *check_base_draws(whole.p, hits, len(state.base_f)),
         *check_rounds(sample, state.rounds),
         *check_regions(whole),
-        *check_discovery(whole.p, high, raised, discovery, goal.confidence),
     ]
     return replace(
         outcome,
         warnings=(*outcome.warnings, *doubts),
+        remarks=(*outcome.remarks, *describe_discovery(whole.p, high, raised, discovery, goal.confidence)),
         sample=replace(points, lineages=discovery.lineages),
         draw_weights=tuple(w for part, first in parts for w in part.draws.weights_after(first, whole.draws.n)),
         status=Status.STOPPED if stopped else outcome.status,

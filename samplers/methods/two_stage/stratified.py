@@ -246,8 +246,8 @@ def check_regions(final: StratifiedSample) -> list[str]:
     ]
 
 
-def check_discovery(p: float, high: float, raised: float, discovery: Discovery, confidence: float) -> list[str]:
-    """Return a warning if more of p may be unseen than was found, and the interval is mostly what that adds to it.
+def describe_discovery(p: float, high: float, raised: float, discovery: Discovery, confidence: float) -> list[str]:
+    """Return a remark if much of p may be unseen, and the interval is mostly what that adds to it.
 
     `raised` is its upper end with the unseen share, `high` the one without.
     """
@@ -257,5 +257,5 @@ def check_discovery(p: float, high: float, raised: float, discovery: Discovery, 
     size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)"
     return [
         f"{discovery.searches:.0f} independent searches reached failure, in {discovery.regions} regions: further "
-        f"failure regions {size} cannot be excluded."
+        f"failure regions {size} cannot be excluded, and the interval includes them."
     ]

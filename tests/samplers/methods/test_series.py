@@ -215,7 +215,8 @@ def test_simulations_made_by_the_user_are_searched_as_before():
     run = samplers.TwoStage().start(problem, seed=1, max_sim=1500)
     while not run.done:
         run.tell(problem.evaluate(run.ask()))
-    assert run.result() == samplers.estimate(samplers.FunctionProblem(problem.evaluate, dim=40), seed=1, max_sim=1500)
+    alone = samplers.FunctionProblem(problem.evaluate, dim=40)
+    assert run.result() == samplers.estimate(alone, samplers.TwoStage(), seed=1, max_sim=1500)
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_subset_simulation_takes_over(recorder):
 @pytest.mark.parametrize("max_sim", [800, 1500])
 def test_a_small_exploration_says_so(max_sim):
     result = samplers.estimate(half_space(3, 3.0).problem, TS(), seed=0, max_sim=max_sim)
-    assert any("misses one" in text for text in result.warnings) == (max_sim < 1500)
+    assert any("misses one" in text for text in result.remarks) == (max_sim < 1500)
 
 
 @pytest.mark.slow
