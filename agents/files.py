@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from itertools import zip_longest
@@ -20,7 +21,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from rare_envs.files import parse_json_object, replace_file
+from rare_envs.files import open_ordinary, parse_json_object, replace_file
 
 RULE_BASED = "idm"
 """The Intelligent Driver Model with lane keeping."""
@@ -32,6 +33,9 @@ SHIPPED, SUFFIX = Path(__file__).parent / "data", ".safetensors"
 """Folder of the shipped files, and how files of networks end."""
 DRIVER_ENTRY, VISION_ENTRY = "driver", "vision"
 """A header's one entry: several would be written in no fixed order, and equal drivers not as equal bytes."""
+
+MAX_NETWORK_BYTES, MAX_HEADER_BYTES = 2**28, 2**20
+"""Bytes of a file, and of its header with the list of its tensors: the shipped ones have a hundredth of that."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -89,15 +93,15 @@ def write_file(path: Path, tensors: Mapping[str, Tensor], entry: str, header: Ma
 
 def read_file(path: Path, *entries: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return the header of the first of some entries that a file has, and its tensors."""
-    if not path.is_file():
+    if not path.exists():
         raise report_missing_file(path, entries[0])
+    _check_header(path)
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
-        with path.open("rb") as raw:
-            zipped = raw.read(2) == b"PK"
+        zipped = zipfile.is_zipfile(path)
         pickled = " It looks like a file of torch.save; such files can run code and are not read." * zipped
         raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: {error}.{pickled}") from None
     texts = [header[entry] for entry in entries if entry in header]
@@ -107,12 +111,21 @@ def read_file(path: Path, *entries: str) -> tuple[dict[str, Any], dict[str, Tens
     return parse_json_object(texts[0], f"The header of {str(path)!r}"), tensors
 
 
+def _check_header(path: Path) -> None:
+    """Refuse what is no ordinary file, and one that is larger than a network, or has a larger list of its tensors."""
+    with open_ordinary(path, MAX_NETWORK_BYTES) as file:
+        size = int.from_bytes(file.read(8), "little")
+    if size > MAX_HEADER_BYTES:
+        raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: a header of {size:,} bytes.")
+
+
 def holds_vision(path: str | PathLike[str]) -> bool:
     """Return whether a file holds a network with a camera; False if it cannot be read."""
     try:
+        _check_header(Path(path))
         with safe_open(path, framework="pt") as file:
             return VISION_ENTRY in (file.metadata() or {})
-    except (SafetensorError, OSError):
+    except (SafetensorError, OSError, ValueError):
         return False
 
 

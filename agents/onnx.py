@@ -18,10 +18,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from agents.files import report_missing_file
+from agents.files import MAX_NETWORK_BYTES, report_missing_file
 from agents.saved_ego import SavedEgo
 from rare_envs.control.actions import DISCRETE_ACTIONS
-from rare_envs.files import replace_file
+from rare_envs.files import open_ordinary, replace_file
 from rare_envs.plugins import one_line
 from rare_envs.startup import advise_install
 
@@ -49,8 +49,9 @@ class OnnxEgo:
 
     def __init__(self, path: Path) -> None:
         """Read the file, and refuse a graph of another form."""
-        if not path.is_file():
+        if not path.exists():
             raise report_missing_file(path)
+        open_ordinary(path, MAX_NETWORK_BYTES).close()
         try:
             import onnxruntime
         except ImportError as error:

@@ -78,6 +78,8 @@ def open_pickle(content: bytes) -> Any:
 
 MAX_AXES, MAX_SIZE = 8, 2**31
 """Most axes of an array, and the largest size of one."""
+MAX_STEPS = 500_000
+"""Instructions of a pickle, each of which may make an object; that of a policy has some thousand."""
 
 
 class _Note:
@@ -114,12 +116,23 @@ def _is_key(value: object) -> bool:
 _PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009  (in Python, not in C; unknown to type checkers)
 
 
-def _check_keys(step: bytes, keys: slice) -> Callable[[Any], None]:
-    """Return a step whose keys, a part of the stack, are checked first."""
+_KEYS = {
+    pickle.SETITEM[0]: slice(-2, -1),
+    **dict.fromkeys((pickle.SETITEMS[0], pickle.DICT[0]), slice(None, None, 2)),
+    **dict.fromkeys((pickle.ADDITEMS[0], pickle.FROZENSET[0]), slice(None)),
+}
+"""Parts of the stack that are keys, by instruction."""
+
+
+def _check(code: int, step: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Return an instruction that is counted, and whose keys are checked first."""
 
     def load(self: Any) -> None:
-        require(all(map(_is_key, self.stack[keys])), "it has keys that are no text or numbers")
-        _PythonUnpickler.dispatch[step[0]](self)
+        self.steps += 1
+        require(self.steps <= MAX_STEPS, f"it has more than {MAX_STEPS:,} instructions")
+        keys = self.stack[_KEYS[code]] if code in _KEYS else ()
+        require(all(map(_is_key, keys)), "it has keys that are no text or numbers")
+        step(self)
 
     return load
 
@@ -128,13 +141,9 @@ class _InertUnpickler(_PythonUnpickler):  # type: ignore[misc]
     """Unpickler that makes notes in place of objects, and hashes nothing that takes ages to hash."""
 
     dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
-        **_PythonUnpickler.dispatch,
-        pickle.SETITEM[0]: _check_keys(pickle.SETITEM, slice(-2, -1)),
-        pickle.SETITEMS[0]: _check_keys(pickle.SETITEMS, slice(None, None, 2)),
-        pickle.DICT[0]: _check_keys(pickle.DICT, slice(None, None, 2)),
-        pickle.ADDITEMS[0]: _check_keys(pickle.ADDITEMS, slice(None)),
-        pickle.FROZENSET[0]: _check_keys(pickle.FROZENSET, slice(None)),
+        code: _check(code, step) for code, step in _PythonUnpickler.dispatch.items()
     }
+    steps = 0
 
     def find_class(self, module: str, name: str) -> type[_Note]:
         """Return a kind of note for a name."""

@@ -23,6 +23,7 @@ from agents.files import report_missing_file
 from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks, open_pickle
 from agents.sb3_archive import build_policy, check_space, find_algorithm, read_archive
 from rare_envs.egos.wrappers import UNBOUNDED, WrappedPolicy, find_stacking
+from rare_envs.files import read_bytes
 from rare_envs.plugins import one_line
 from rare_envs.startup import advise_install
 
@@ -31,7 +32,7 @@ HUB_PREFIX = "hf:"
 _HUB_NAME = re.compile(r"hf:([\w-][\w.-]*)/([\w-][\w.-]*)(?:/([\w-][\w.-]*\.zip))?(?:@([\w-][\w.-]*))?")
 _NOT_MODELS = ("train_eval_metrics.zip", "replay.zip")
 """Files that RL Zoo puts beside a model."""
-_MAX_STATISTICS = 64 * 2**20
+_MAX_STATISTICS = 2**26
 """Largest file of statistics [bytes]."""
 _NAMES = ("vecnormalize", "vec_normalize")
 """Names of files of statistics: Stable-Baselines3's callbacks and RL Zoo write the first, its examples the second."""
@@ -126,14 +127,14 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
     """
     if not path.exists():
         raise report_missing_file(path)
-    if not path.is_file():
+    if path.is_dir():
         raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
     statistics_path = find_statistics(path) if stats is None else Path(stats)
-    if statistics_path is not None and not statistics_path.is_file():
+    if statistics_path is not None and not statistics_path.exists():
         raise FileNotFoundError(f"No VecNormalize statistics at {str(statistics_path)!r}.")
     if not trust and (risks := find_origin_risks(path, statistics_path)):
         raise ValueError(f"Will not open it: {'; '.join(risks)}; {TRUST_ADVICE}.")
-    header, weights = read_archive(path.read_bytes(), str(path))
+    header, weights = read_archive(path)
     name = find_algorithm(header, algo, str(path))
     try:
         policy, policy_kwargs = build_policy(name, header, weights, trust)
@@ -179,10 +180,8 @@ def load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
 
     what = f"VecNormalize statistics {str(path)!r}"
     elsewhere = "move the file away if it does not belong to this ego"
-    if path.stat().st_size > _MAX_STATISTICS:
-        raise ValueError(f"{what} are larger than {_MAX_STATISTICS / 2**20:.0f} MiB.")
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, _MAX_STATISTICS)
         statistics = pickle.loads(content) if trust else open_pickle(content)
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"expected VecNormalize, got {type(statistics).__name__}")

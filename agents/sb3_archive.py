@@ -12,12 +12,11 @@ from __future__ import annotations
 import base64
 import contextlib
 import io
-import json
 import math
 import pickle
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from agents.safe_pickle import ForbiddenObject, open_pickle, require
+from rare_envs.files import MAX_MEMBERS, parse_json_object, read_members
 from rare_envs.plugins import did_you_mean
 
 
@@ -55,62 +55,32 @@ ALGORITHMS = {
     "qrdqn": Algorithm(("sb3_contrib.qrdqn.",)),
     "crossq": Algorithm(("sb3_contrib.crossq.",)),
 }
-MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
-"""Bytes that any archive may unpack to, and the factor by which a larger one may grow: Stable-Baselines3 stores its
-members uncompressed, so 20 refuses no policy."""
-MAX_VALUES = 1_000_000
-"""Values in the settings of a model."""
 MAX_OBSERVED = 2**22
 """Most numbers of an observation, and most actions to choose from."""
 _SPARE = 1_000, 2**20
 """Parameters, and numbers in them, that building a policy may take beside twice those in the file."""
+_MAX_NOTES = 2**20
+"""Bytes of the pickle that names the tensors in a member: some 100 for each, and each byte may become 60."""
 _PER_BYTE = 8
 """Bytes of tensors for each byte of a member, which tensors may share."""
 
 
-class ArchiveTooLarge(ValueError):
-    """An archive that would take far more memory than its own size."""
-
-
-def read_archive(content: bytes, name: str) -> tuple[dict[str, Any], bytes]:
-    """Return the settings of a saved model, their pickles closed, with "version" (of Stable-Baselines3); the weights.
-
-    Its name is for messages.
-    """
-    file, version = io.BytesIO(content), "_stable_baselines3_version"
-    if not zipfile.is_zipfile(file):
-        raise ValueError(f"{name!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3.")
+def read_archive(path: Path) -> tuple[dict[str, Any], bytes]:
+    """Return the settings of a saved model, their pickles closed, with the "version" that saved it; and the weights."""
+    name, version = repr(str(path)), "_stable_baselines3_version"
     try:
-        with zipfile.ZipFile(file) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-            if unpacked > max(MAX_UNPACKED, MAX_RATIO * len(content)):
-                sizes = f"from {len(content) / 1e6:.1f} to {unpacked / 1e6:,.0f} MB"
-                raise ArchiveTooLarge(f"{name!r} would unpack {sizes}; no policy does that.")
-            members = {
-                member: archive.read(member)
-                for member in ("data", "policy.pth", version)
-                if member in archive.namelist()
-            }
-        header = _parse_settings(members.get("data", b"{}"), name)
-    except ArchiveTooLarge:
-        raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, RecursionError, OSError) as error:
-        raise ValueError(f"{name!r} is damaged ({error}); save the model again.") from error
-    if not isinstance(header, dict) or "policy.pth" not in members or "policy_class" not in header:
+        members = read_members(path, ("data", "policy.pth", version))
+        header = parse_json_object(members.get("data", b"{}").decode(), f"The member 'data' of {name}")
+    except ValueError as error:
+        raise ValueError(f"{error} Expected a model as Stable-Baselines3 saves it.") from error
+    if "policy.pth" not in members or "policy_class" not in header:
         raise ValueError(
-            f"{name!r} is a zip file but not a Stable-Baselines3 model: it lacks its members "
+            f"{name} is a zip file but not a Stable-Baselines3 model: it lacks its members "
             "'data' and 'policy.pth'. Write it with model.save(path)."
         )
     return {**header, "version": members.get(version, b"unknown").decode(errors="replace").strip()}, members[
         "policy.pth"
     ]
-
-
-def _parse_settings(content: bytes, name: str) -> Any:
-    """Return the JSON of the settings, unless it has more values than any policy: each takes some 100 bytes."""
-    if content.count(b",") + content.count(b"[") + content.count(b"{") > MAX_VALUES:
-        raise ArchiveTooLarge(f"{name!r} has more than {MAX_VALUES:,} values in its settings; no policy does that.")
-    return json.loads(content)
 
 
 def find_algorithm(header: Mapping[str, Any], algo: str | None, name: str) -> str:
@@ -188,8 +158,11 @@ def _read_tensors(content: bytes, trust: bool) -> dict[str, Tensor]:
     """Return the weights in a `.pth` member, which fit into it, on the CPU."""
     if not zipfile.is_zipfile(io.BytesIO(content)):
         raise ValueError("its tensors are not in the format of torch 1.6 and later")
+    require(content.count(b"PK\1\2") <= MAX_MEMBERS, f"it has more than {MAX_MEMBERS:,} tensors")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         infos = archive.infolist()
+    notes = [info.file_size for info in infos if info.filename.endswith(".pkl")]
+    require(max(notes, default=0) <= _MAX_NOTES, "its tensors have more names than any policy")
     stored = all(info.compress_type == zipfile.ZIP_STORED for info in infos)
     fits = stored and sum(info.file_size for info in infos) <= len(content)
     require(fits, "its tensors would unpack to more than the file holds")

@@ -1,24 +1,34 @@
-"""Files that are replaced whole, files that somebody else may have written, and JSON text.
+"""Files that are replaced whole, files that somebody else may have written, archives in them, and JSON text.
 
 Whoever is killed while writing, or runs out of space, leaves the earlier file. What somebody else may have written is
-read only where it is an ordinary file of a bounded size.
+read only where it is an ordinary file of a bounded size, from which no more is made than so many values.
 """
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import functools
 import hashlib
+import io
 import json
 import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+import sys
+import zipfile
+from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-MAX_TEXT_BYTES = 2**28
-"""Bytes of a text of a run: 1,000 failures with 10,000 numbers each have fewer."""
+if TYPE_CHECKING:
+    import pyarrow.parquet
+
+MAX_TEXT_BYTES, MAX_VALUES = 2**26, 1_000_000
+"""Bytes of a text, and values in it, each of which takes some 100 bytes: 1,000 failures of 1,000 numbers have fewer."""
+DIGESTED_BYTES = 2**27
+"""Bytes at each end of a file that its digest is of: all of an ego, and those of a table that a change moves."""
 
 
 @contextlib.contextmanager
@@ -63,27 +73,112 @@ def replace_text(path: str | Path, text: str) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def check_ordinary(path: str | Path, most: int | None = None) -> None:
-    """Refuse what is no ordinary file, such as a pipe or a device without an end, or has more bytes than `most`."""
-    found = os.stat(path)
+def open_ordinary(path: str | Path, most: int = sys.maxsize) -> BinaryIO:
+    """Open an ordinary file of at most so many bytes for reading.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+        ValueError: It is something else, such as a folder, a pipe or a device without an end, or has more bytes.
+    """
+    # a pipe would be waited for
+    number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    found = os.fstat(number)
+    if stat.S_ISREG(found.st_mode) and found.st_size <= most:
+        return os.fdopen(number, "rb")
+    os.close(number)
     if not stat.S_ISREG(found.st_mode):
         raise ValueError(f"{str(path)!r} is no ordinary file.")
-    if most is not None and found.st_size > most:
-        raise ValueError(f"{str(path)!r} has {found.st_size:,} bytes, more than {most:,}.")
+    raise ValueError(f"{str(path)!r} has {found.st_size:,} bytes, more than {most:,}.")
 
 
-def read_text_file(path: str | Path) -> str:
-    """Return the text of an ordinary file in UTF-8 of at most `MAX_TEXT_BYTES`."""
-    check_ordinary(path, MAX_TEXT_BYTES)
-    return Path(path).read_text(encoding="utf-8")
+def read_bytes(path: str | Path, most: int) -> bytes:
+    """Return what an ordinary file of at most so many bytes holds; see `open_ordinary`."""
+    with open_ordinary(path, most) as file:
+        content = file.read(most + 1)
+    if len(content) > most:  # it has grown, or the system makes it as it is read
+        raise ValueError(f"{str(path)!r} has more than {most:,} bytes.")
+    return content
+
+
+def read_text_file(path: str | Path, most: int = MAX_TEXT_BYTES) -> str:
+    """Return the text of an ordinary file in UTF-8, with or without a mark of the order of bytes; see `read_bytes`."""
+    try:
+        return read_bytes(path, most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{str(path)!r} is no text in UTF-8: {error.reason} at byte {error.start:,}.") from error
+
+
+MAX_ARCHIVE_BYTES, MAX_MEMBERS = 2**30, 10_000
+"""Bytes of an archive, and members of it."""
+MAX_UNPACKED, MAX_RATIO = 2**26, 4
+"""Bytes that any members may unpack to, and the factor by which larger ones may grow: weights and noise do not shrink
+when they are packed."""
+
+
+def read_members(path: str | Path, names: Container[str] | None = None) -> dict[str, bytes]:
+    """Return what the members of a zip file hold by name, those of some names or all.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+        ValueError: It is no ordinary file, no zip file, is damaged, or would unpack to far more than its own size.
+    """
+    with open_ordinary(path, MAX_ARCHIVE_BYTES) as file:
+        if not zipfile.is_zipfile(file):
+            raise ValueError(f"{str(path)!r} is not a zip file (or is cut short).")
+        file.seek(0)
+        if sum(block.count(b"PK\1\2") for block in iter(functools.partial(file.read, 1 << 20), b"")) > MAX_MEMBERS:
+            raise ValueError(f"{str(path)!r} has more than {MAX_MEMBERS:,} members.")
+        size = os.fstat(file.fileno()).st_size
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = [member for member in archive.infolist() if names is None or member.filename in names]
+                unpacked = sum(member.file_size for member in members)
+                if unpacked > max(MAX_UNPACKED, MAX_RATIO * size):
+                    raise ValueError(f"it would unpack from {size / 1e6:,.1f} to {unpacked / 1e6:,.0f} MB")
+                return {member.filename: archive.read(member) for member in members}
+        except Exception as error:  # the archive and each kind of compression have errors of their own
+            raise ValueError(f"{str(path)!r} is damaged: {error}.") from error
+
+
+MAX_FOOTER_BYTES = 2**26
+"""Bytes of the end of a Parquet file that describes it: a hundred row groups of 1,000 columns have a sixth of that."""
+
+
+@contextlib.contextmanager
+def open_parquet(path: str | Path) -> Iterator[pyarrow.parquet.ParquetFile]:
+    """Yield an ordinary Parquet file; a ValueError says in one line what is wrong with it."""
+    import pyarrow.parquet  # slow, and only tables need it
+
+    try:
+        with open_ordinary(path) as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - 8))
+            if int.from_bytes(file.read(4), "little") > MAX_FOOTER_BYTES:
+                raise ValueError("its end, which describes it, is too large.")
+        with pyarrow.parquet.ParquetFile(path) as table:
+            yield table
+    except (OSError, ValueError) as error:
+        raise ValueError(f"Cannot read {str(path)!r}: {' '.join(str(error).split())}") from error
+
+
+def read_rows(path: str | Path) -> list[list[str]]:
+    """Return the rows of a CSV file, those without a cell left out; a ValueError says what is wrong with it."""
+    text = read_text_file(path)
+    if text.count(",") + text.count("\n") > MAX_VALUES:
+        raise ValueError(f"{str(path)!r} has more than {MAX_VALUES:,} cells.")
+    try:
+        return [row for row in csv.reader(io.StringIO(text, newline="")) if row]
+    except csv.Error as error:
+        raise ValueError(f"{str(path)!r} is no CSV: {error}.") from error
 
 
 def digest_file(path: Path) -> str:
-    """Return the BLAKE2b digest of a file."""
+    """Return the BLAKE2b digest of an ordinary file; of a larger one, of its first and last `DIGESTED_BYTES`."""
     digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
+    with open_ordinary(path) as file:
+        for start in (0, max(DIGESTED_BYTES, os.fstat(file.fileno()).st_size - DIGESTED_BYTES)):
+            file.seek(start)
+            for _ in range(DIGESTED_BYTES >> 20):
+                digest.update(file.read(1 << 20))
     return digest.hexdigest()
 
 
@@ -110,6 +205,8 @@ def _parse_int(digits: str) -> int:
 
 def parse_json_object(text: str, source: str) -> dict[str, Any]:
     """Return the JSON object that a text holds; `source` says in an error what it was read from."""
+    if sum(map(text.count, ",[{")) > MAX_VALUES:
+        raise ValueError(f"{source} has more than {MAX_VALUES:,} values.")
     try:
         data = json.loads(text, parse_int=_parse_int)
     except RecursionError:

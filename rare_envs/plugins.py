@@ -8,11 +8,14 @@ import inspect
 import os
 import re
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any, ClassVar, NoReturn
 
+_ODD, _JOINERS = re.compile(r"[^\n -~]"), "\u200c\u200d"
+"""Letters to look at, and those without a width that words of some languages need."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _MAX_WORDS = 200
 """Characters of an exception's message that `one_line` keeps: a line of a terminal or two."""
@@ -77,9 +80,24 @@ def check_name(kind: str, name: object, valid: Iterable[str]) -> None:
         raise ValueError(f"Unknown {kind} {name!r}{hint}; expected one of {', '.join(map(repr, names))}.")
 
 
+def clean_text(text: str) -> str:
+    r"""Return a text of somebody else's with the letters that steer a terminal, hide others or are no XML as escapes.
+
+    Example:
+        >>> print(clean_text("\x1b[2Jgap\u202e"))
+        \x1b[2Jgap\u202e
+    """
+
+    def show(found: re.Match[str]) -> str:
+        harmless = found[0].isprintable() or found[0] in _JOINERS or unicodedata.category(found[0]) == "Zs"
+        return found[0] if harmless else found[0].encode("unicode_escape").decode()
+
+    return _ODD.sub(show, text)
+
+
 def one_line(error: BaseException) -> str:
     """Return an exception as a line without colours and full stop: class, up to 200 characters of its message."""
-    words = " ".join(_COLOUR.sub("", str(error)).split()).rstrip(".")
+    words = clean_text(" ".join(_COLOUR.sub("", str(error)).split())).rstrip(".")
     kind = type(error).__name__
     return f"{kind}: {words[:_MAX_WORDS]}" if words else kind
 
@@ -97,7 +115,7 @@ class NoAnswer(RuntimeError):
 
 def reason_of(error: BaseException) -> str:
     """Return what went wrong, in one line."""
-    words = " ".join(str(error).split())
+    words = clean_text(" ".join(str(error).split()))
     if isinstance(error, ValueError) and words:  # ours say what is wrong by themselves
         return words
     return f"{type(error).__name__}: {words}" if words and not isinstance(error, SystemExit) else repr(error)

@@ -10,7 +10,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import secrets
+import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 FILE_FORMAT = "samplers 1"
 """First word of the metadata; another one is of another version."""
 _KEY = "samplers"
+MAX_BYTES, MAX_HEADER_BYTES = 2**32, 2**26
+"""Bytes of a file that is read, 40 million simulations of twelve numbers, and of what is no array in it."""
 _Stored = TypeVar("_Stored")
 _CLASSES: dict[str, type] = {}
 
@@ -98,9 +102,16 @@ def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:
     from safetensors import SafetensorError, safe_open
 
     where = repr(str(path))
-    if not Path(path).is_file():
+    if not Path(path).exists():
         raise FileNotFoundError(f"There is no file {where}.")
     try:
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
+            raise ValueError("it is no ordinary file")
+        with open(path, "rb") as raw:
+            sizes = found.st_size, int.from_bytes(raw.read(8), "little")
+        if sizes[0] > MAX_BYTES or sizes[1] > MAX_HEADER_BYTES:
+            raise ValueError(f"it has {sizes[0]:,} bytes and a header of {sizes[1]:,}")
         with safe_open(str(path), framework="np") as file:
             about = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # not a mapping

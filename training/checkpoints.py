@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rare_envs.files import replace_file
+from rare_envs.files import open_ordinary, replace_file
 
 CHECKPOINT_FORMAT = 3
 """Version of the file."""
@@ -34,6 +34,7 @@ def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
 def read_checkpoint(path: Path, entries: Sequence[str], device: torch.device | str = "cpu") -> dict[str, Any]:
     """Return the state that `write_checkpoint` wrote, which is to have some entries; a ValueError if it is damaged."""
     try:
+        open_ordinary(path).close()
         state: dict[str, Any] = torch.load(path, weights_only=True, map_location=device)
         if not state.keys() >= {*entries}:
             raise ValueError("it lacks some of the state")

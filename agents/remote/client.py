@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -26,7 +27,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from agents.remote import protocol
 from agents.remote.protocol import SECRET_VARIABLE, MalformedMessage, Message, Socket, demand
-from rare_envs.plugins import EgoGone, NoAnswer
+from rare_envs.plugins import EgoGone, NoAnswer, clean_text
 from rare_envs.simulation.observation import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0
@@ -37,8 +38,10 @@ _HELLO_INTERVAL, _RETRY_PAUSE = 1.0, 0.1
 """Time [s] after which a hello is sent again and the user told of the wait; between attempts that fail at once."""
 _PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
 """A part of a batch that was not answered gets this multiple of the longest answer so far, and at least so long [s]."""
-_LOOK, _EXIT_WAIT = 0.1, 1.0
-"""Time [s] between looks whether a process is there, and for one that closed its socket to end."""
+_LOOK, _EXIT_WAIT = 0.02, 1.0
+"""Time [s] between looks whether a process is there and what has come, and for one that closed its socket to end."""
+_RECEIVED = slice(128, 136)
+"""Place of the bytes received in what Linux tells of a connection."""
 _HANDSHAKE = f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none"
 _BROKEN = {
     zmq.EVENT_CLOSED: "nothing listens there",
@@ -77,27 +80,29 @@ class ServerLink:
         self.address, self._secret = address, secret
         self._socket: Socket | None = None
         self._monitor: Socket | None = None
+        self._connection: socket.socket | None = None
+        self._counts = address.startswith("tcp://") and hasattr(socket, "TCP_INFO")  # of Linux
 
     def open(self) -> None:
         """Connect anew; a request under way is dropped."""
         self.close()
         # of one context for all links: ending a context may wait, closing a socket does not
         self._socket = zmq.Context.instance().socket(zmq.DEALER)
-        for option, value in ((zmq.LINGER, 0), (zmq.RECONNECT_IVL, 100), (zmq.MAXMSGSIZE, protocol.MAX_BYTES)):
+        for option, value in ((zmq.LINGER, 0), (zmq.RECONNECT_IVL, 100), (zmq.MAXMSGSIZE, protocol.MAX_ANSWER_BYTES)):
             self._socket.setsockopt(option, value)
-        self._monitor = self._socket.get_monitor_socket(sum(_BROKEN))
+        self._monitor = self._socket.get_monitor_socket(sum(_BROKEN) + self._counts * zmq.EVENT_CONNECTED)
         self._attach(self._socket)
 
-    def _attach(self, socket: Socket) -> None:
+    def _attach(self, link: Socket) -> None:
         """Connect a socket to the server."""
         if self._secret is not None:
-            socket.curve_serverkey = protocol.derive_server_keys(self._secret)[0]
-            socket.curve_publickey, socket.curve_secretkey = zmq.curve_keypair()
+            link.curve_serverkey = protocol.derive_server_keys(self._secret)[0]
+            link.curve_publickey, link.curve_secretkey = zmq.curve_keypair()
         port = self.address.rpartition(":")[2]
         if self.address.startswith("tcp://") and port.isdigit() and not 0 < int(port) < 65536:
             raise ValueError(f"Cannot connect to {self.address!r}: expected a port from 1 to 65535.")
         try:
-            socket.connect(self.address)
+            link.connect(self.address)
         except zmq.ZMQError as error:
             raise ValueError(f"Cannot connect to {self.address!r}: {error}; expected tcp://host:port.") from error
 
@@ -105,20 +110,36 @@ class ServerLink:
         """Send a message and return its answer, which comes within a time [s]."""
         assert self._socket is not None and self._monitor is not None
         self._socket.send_multipart([b"", content])
-        poller, deadline = zmq.Poller(), time.monotonic() + timeout
+        poller, deadline, before = zmq.Poller(), time.monotonic() + timeout, self._count_received()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._monitor, zmq.POLLIN)
         while True:
             left = deadline - time.monotonic()
             ready = dict(poller.poll(math.ceil(1000 * max(0.0, min(left, _LOOK)))))
-            if self._socket in ready:
+            # ZeroMQ bounds each frame, and keeps the frames of a message until the last one is there
+            most = protocol.MAX_ANSWER_BYTES
+            demand(self._count_received() - before <= most, f"an answer of more than {most:,} bytes")
+            told = self._monitor in ready and (self._socket not in ready or (self._counts and self._connection is None))
+            news = recv_monitor_message(self._monitor) if told else None
+            if news is not None and news["event"] == zmq.EVENT_CONNECTED:
+                with contextlib.suppress(OSError):  # it is gone already
+                    self._connection = socket.socket(fileno=os.dup(news["value"]))
+                before = self._count_received()
+            elif self._socket in ready:
                 return protocol.open_envelope(self._socket.recv_multipart())[1]
-            if ready:
-                event = zmq.Event(recv_monitor_message(self._monitor)["event"])
+            elif news is not None:
+                event = zmq.Event(news["event"])
                 raise (RemoteError if event in _HOPELESS else LinkError)(_BROKEN[event])
             if left <= 0:
                 raise NoAnswer(f"no answer within {timeout:.3g} s")
             self._look()
+
+    def _count_received(self) -> int:
+        """Return how many bytes have come over the connection; 0 where the system does not count them."""
+        if self._connection is None:
+            return 0
+        told = self._connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED.stop)
+        return int.from_bytes(told[_RECEIVED], sys.byteorder)
 
     def _look(self) -> None:
         """Raise a LinkError if what is there without a connection has ended."""
@@ -129,7 +150,9 @@ class ServerLink:
             self._socket.disable_monitor()
             self._monitor.close(0)
             self._socket.close(0)
-        self._socket = self._monitor = None
+        if self._connection is not None:
+            self._connection.close()
+        self._socket = self._monitor = self._connection = None
 
     def __del__(self) -> None:
         self.close()
@@ -152,11 +175,11 @@ class ProcessLink(ServerLink):
             raise ValueError("Expected Linux or macOS for process:EGO, whose socket is a file; use serve-ego.")
         self._arguments = json.dumps({"spec": spec, **how}, default=str)
 
-    def _attach(self, socket: Socket) -> None:
-        """Start a process that connects to a socket."""
+    def _attach(self, link: Socket) -> None:
+        """Start a process that connects to a link."""
         self._folder = tempfile.mkdtemp(prefix="rare-envs-")
         address = f"ipc://{self._folder}/ego"
-        socket.bind(address)
+        link.bind(address)
         # not -m, which finds modules in the working directory first: it may be somebody else's folder
         code = f"import sys; sys.path[:] = {sys.path!r}; from agents.remote.server import main; main(*sys.argv[1:])"
         words = [sys.executable, "-c", code, address, self._arguments]
@@ -388,8 +411,7 @@ class RemoteEgo:
 def _one_line(text: Any, most: int) -> str:
     """Return what a server said, whatever it is, as one line that a terminal can show."""
     said = text if isinstance(text, str) else protocol.show(text, most)
-    shown = "".join(letter if letter.isprintable() else " " for letter in said[: 4 * most])
-    return " ".join(shown.split())[:most]
+    return clean_text(" ".join(said[: 4 * most].split()))[:most]
 
 
 def connect(spec: str) -> RemoteEgo:

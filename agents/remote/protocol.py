@@ -31,8 +31,8 @@ from rare_envs.plugins import reason_of
 
 PROTOCOL = 1
 """Version of the protocol; both sides must speak the same."""
-MAX_BYTES = 256 * 2**20
-"""Largest message."""
+MAX_BYTES, MAX_ANSWER_BYTES = 2**28, 2**24
+"""Largest message, and the largest with actions: 65,536 rows of 32 numbers."""
 MAX_BATCH = 2**16
 """Most rows of a batch."""
 MAX_COUNT = 2**63 - 1

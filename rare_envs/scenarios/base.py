@@ -18,7 +18,7 @@ from torch import Tensor
 from rare_envs.devices import scalars
 from rare_envs.distributions.fitted import FITTED_KEYS, FileDistribution, FittedDistribution, read_distribution
 from rare_envs.distributions.space import Distribution, Parameter
-from rare_envs.files import parse_json_object
+from rare_envs.files import parse_json_object, read_text_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State, point_mass
@@ -242,15 +242,15 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
         return _fit_to(scenario, str(base), _read(*where, {**own, **found}))
     if not callable(getattr(found, "read_text", None)):
         return _check_object(scenario, found)
-    if isinstance(found, Path) and not found.is_file():
+    if isinstance(found, Path) and (not found.exists() or found.is_dir()):
         raise ValueError(
             f"No base distribution {str(base)!r} for {scenario.name}"
             f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
         )
     try:
-        text = found.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the base distribution {found}: {error}.") from None
+        text = read_text_file(found) if isinstance(found, Path) else found.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"Cannot read the base distribution {str(found)!r}: {error}") from None
     return _fit_to(scenario, str(base), _read_text(*where, text))
 
 

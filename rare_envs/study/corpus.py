@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 import reprlib
 import time
 import xml.etree.ElementTree as ET
@@ -22,8 +21,9 @@ import agents
 from agents.loading import find_ego_kind
 from agents.saved_ego import load_saved_ego
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.files import check_ordinary, parse_json_object, replace_file, replace_text
+from rare_envs.files import parse_json_object, read_text_file, replace_file, replace_text
 from rare_envs.make import set_up
+from rare_envs.plugins import clean_text
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
@@ -139,8 +139,7 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
     found = []
     with as_bad_input(ValueError, OSError):
         for path in paths:
-            check_ordinary(path, MAX_STORED)
-            found.append(parse_stored(path.read_bytes().decode("utf-8", "replace"), repr(str(path))))
+            found.append(parse_stored(read_text_file(path, MAX_STORED), repr(str(path))))
     return found
 
 
@@ -266,10 +265,6 @@ def try_world(problem: DrivingProblem, failures: Sequence[StoredFailure]) -> lis
     return trials
 
 
-_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that XML 1.0 cannot hold."""
-
-
 def write_junit(path: Path, trials: Sequence[Trial], ego: str, seconds: float) -> None:
     """Write a report of test cases, one for each stored scenario; `seconds` is the wall time of all of them."""
     outcomes = [trial.outcome for trial in trials]
@@ -277,7 +272,7 @@ def write_junit(path: Path, trials: Sequence[Trial], ego: str, seconds: float) -
     counts = {"tests": str(len(trials)), "failures": failed, "errors": errors, "time": f"{seconds:.3f}"}
 
     def add(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
-        return ET.SubElement(parent, tag, {name: _NOT_XML.sub("?", text) for name, text in attributes.items()})
+        return ET.SubElement(parent, tag, {name: clean_text(text) for name, text in attributes.items()})
 
     root = ET.Element("testsuites", counts)
     suite = add(root, "testsuite", name=f"rare-envs corpus, ego {ego}", skipped="0", **counts)

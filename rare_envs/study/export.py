@@ -28,7 +28,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from rare_envs.files import replace_file
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import clean_text, did_you_mean
 from rare_envs.problem import DrivingProblem
 from rare_envs.startup import __version__, advise_install
 from rare_envs.study.replay import Drive, drive_again
@@ -103,7 +103,7 @@ def export_drive(
     trajectories, road = find_trajectories(drive), drive.road
     along = drive.position[..., 0]
     start, end = float(np.floor(along.min() - _MARGIN)), float(np.ceil(along.max() + _MARGIN))
-    title = f"{drive.problem.env_id}, f = {drive.f:.4g}"
+    title = clean_text(f"{drive.problem.env_id}, f = {drive.f:.4g}")
     path.parent.mkdir(parents=True, exist_ok=True)
     if format == "commonroad":
         write_commonroad(path, trajectories, road, (start, end), title, free)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 from matplotlib.transforms import Affine2D
 from PIL import Image, ImageDraw
 
@@ -21,7 +25,7 @@ from rare_envs.envs import rendering
 from rare_envs.exposure import RateInterval, TotalRate
 from rare_envs.files import replace_file
 from rare_envs.people import HumanBenchmark
-from rare_envs.plugins import EgoGone, reason_of
+from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
 from rare_envs.study.events import EventRate
@@ -48,23 +52,53 @@ NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
-STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.usetex": False}
 """Settings of matplotlib for every picture. Each is a `Figure` of its own, without pyplot: no window, no global state,
 whatever backend the user has."""
 DOTS_PER_INCH = 120
 """Resolution of every picture."""
+MOST_LETTERS = 1_000
+"""Of one text in a picture."""
 LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
 
 
 @contextlib.contextmanager
 def saved_figure(path: Path, width: float, height: float) -> Iterator[Figure]:
-    """Yield an empty picture of a size [inch], which is saved at the end of the block."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        yield figure
-        figure.set_dpi(DOTS_PER_INCH)
-        with replace_file(path) as draft:
-            FigureCanvasAgg(figure).print_png(draft)  # type: ignore[no-untyped-call]
+    """Yield an empty picture of a size [inch], which is saved at the end of the block; a warning if it cannot be drawn.
+
+    Numbers that are written beside it do not wait for it.
+    """
+    try:
+        with drawing():
+            figure = Figure(figsize=(width, height), layout="constrained")
+            yield figure
+            figure.set_dpi(DOTS_PER_INCH)
+            show_literally(figure)
+            with replace_file(path) as draft:
+                FigureCanvasAgg(figure).print_png(draft)  # type: ignore[no-untyped-call]
+    except OSError:
+        raise
+    except Exception as error:  # of fonts, and of whatever a name or an ego brings along
+        warnings.warn(f"{path.name} is missing, it cannot be drawn: {one_line(error)}.", stacklevel=3)
+
+
+@contextlib.contextmanager
+def drawing(**more: Any) -> Iterator[None]:
+    """Draw in the block by our settings and more of them, without a word on letters that there is no font for."""
+    style: Any = {**STYLE, **more}
+    with matplotlib.rc_context(style), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph |Matplotlib currently does not support")
+        yield
+
+
+def show_literally(artist: Artist) -> None:
+    """Let what is written in a figure be shown as it is, clean and not as mathematics, but for the numbers of axes."""
+    if isinstance(artist, Text):
+        artist.set_text(clean_text(artist.get_text())[:MOST_LETTERS])
+        artist.set_parse_math(False)
+    for part in artist.get_children():
+        if not isinstance(part, Tick):
+            show_literally(part)
 
 
 def save_plot(path: Path, report: Report) -> None:
@@ -359,6 +393,7 @@ def _draw_curves(drive: Drive) -> tuple[Image.Image, list[int], tuple[int, int]]
     axes.yaxis.label.set_fontsize(8)
     axes.tick_params(labelsize=8)
     axes.legend(fontsize=7, loc="upper right", frameon=False)
+    show_literally(figure)
     canvas.draw()
     columns = axes.transData.transform(np.column_stack((drive.time, np.zeros(len(drive.time)))))[:, 0]
     box = axes.get_window_extent()

@@ -33,7 +33,7 @@ from agents.saved_ego import HUB_PREFIX, find_hub_model, find_statistics
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.needs import EgoWarning
-from rare_envs.files import digest_file, parse_json_object, read_text_file
+from rare_envs.files import digest_file, open_ordinary, parse_json_object, read_text_file
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
@@ -82,7 +82,7 @@ def find_notes() -> Path:
 
 
 def _read_notes() -> set[str]:
-    with contextlib.suppress(OSError), find_notes().open("rb") as file:
+    with contextlib.suppress(OSError, ValueError), open_ordinary(find_notes()) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - MAX_NOTES))
         return set(file.read().decode("ascii", "replace").split())
     return set()

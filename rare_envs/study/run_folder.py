@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import csv
 import io
 import math
 import reprlib
 import shlex
-import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.files import check_ordinary, digest_file, parse_json_object, read_text_file
+from rare_envs.files import digest_file, open_parquet, parse_json_object, read_members, read_rows, read_text_file
 from rare_envs.plugins import one_line
 from rare_envs.study.arguments import BadInput, as_bad_input
 
@@ -48,8 +44,6 @@ CRASH = tuple(
     "injury_risk_striking injury_risk_struck".split()
 )
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
-MAX_BLOCK_BYTES = 1 << 30
-"""Bytes of blocks that are unpacked at most: a thousand failures with a quarter of a million values each."""
 MAX_TABLE_BYTES = 2**32
 """Largest table that is read at once [bytes]: 40 million simulations with twelve numbers each."""
 
@@ -83,7 +77,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     """
     try:
         failures = _read_table(folder / FAILURES)
-    except (csv.Error, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{str(folder / FAILURES)!r} is damaged: {str(error).rstrip('.')}.") from error
     if (folder / BLOCKS).exists():
         failures |= _read_blocks(folder / BLOCKS)
@@ -95,7 +89,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
 def _read_table(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns of a table by name."""
-    header, *rows = csv.reader(io.StringIO(read_text_file(path))) or [[]]
+    header, *rows = read_rows(path) or [[]]
     if any(len(row) != len(header) for row in rows):
         raise ValueError("a row has more or fewer cells than the header")
     columns: dict[str, list[NDArray[Any]]] = {}
@@ -110,12 +104,10 @@ def _read_table(path: Path) -> dict[str, NDArray[Any]]:
 def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
     """Return the large blocks by name, shape (n, size)."""
     try:
-        check_ordinary(path)
-        with zipfile.ZipFile(path) as archive:
-            if sum(each.file_size for each in archive.infolist()) > MAX_BLOCK_BYTES:
-                raise ValueError(f"more than {MAX_BLOCK_BYTES:,} bytes unpacked")
-        with np.load(path, allow_pickle=False) as blocks:
-            found = {name: np.asarray(blocks[name]) for name in blocks.files}
+        found = {
+            name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+            for name, content in read_members(path).items()
+        }
         if any(block.dtype.kind != "f" or block.ndim != 2 for block in found.values()):
             raise ValueError("a block is no table of numbers")
     except Exception as error:  # the zip, its compression and NumPy's headers have errors of their own
@@ -171,10 +163,8 @@ class LoadedStudy:
     @property
     def column_names(self) -> list[str]:
         """Columns of the table of all simulations."""
-        import pyarrow.parquet as pq
-
-        with _damage_as_value_error(self.episodes_path):
-            return list(pq.read_schema(self.episodes_path).names)
+        with open_parquet(self.episodes_path) as file:
+            return list(file.schema_arrow.names)
 
     def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
         """Return the table of all simulations, a row each; docs/using_results.md has its columns."""
@@ -187,18 +177,15 @@ class LoadedStudy:
         missing = sorted(set(columns or []) - set(known))
         if missing:
             raise ValueError(f"{EPISODES} has no column {', '.join(missing)}; it has {', '.join(known)}.")
-        _check_size(path, columns or known)
         where = None if failed is None else [("failed", "=", failed)]
-        with _damage_as_value_error(path):
+        with open_parquet(path) as file:
+            _check_size(path, file, columns or known)
             return pq.read_table(path, columns=columns, filters=where)
 
 
-def _check_size(path: Path, columns: list[str]) -> None:
+def _check_size(path: Path, file: pyarrow.parquet.ParquetFile, columns: list[str]) -> None:
     """Raise a ValueError if some columns of a table would take more than `MAX_TABLE_BYTES`."""
-    import pyarrow.parquet as pq
-
-    with _damage_as_value_error(path), pq.ParquetFile(path) as file:
-        about, schema = file.metadata, file.schema_arrow
+    about, schema = file.metadata, file.schema_arrow
     n_rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
     n_bytes = 8 * n_rows * sum(int(getattr(schema.field(name).type, "list_size", 1)) for name in columns)
     if n_bytes > MAX_TABLE_BYTES:
@@ -207,15 +194,6 @@ def _check_size(path: Path, columns: list[str]) -> None:
             f"{MAX_TABLE_BYTES / 2**30:g} GiB that are read at once: ask for fewer columns, or read {str(path)!r} in "
             "parts by a program of your own."
         )
-
-
-@contextlib.contextmanager
-def _damage_as_value_error(path: Path) -> Iterator[None]:
-    """Raise errors of Arrow, which differ by the kind of damage, as a ValueError in one line."""
-    try:
-        yield
-    except (OSError, ValueError) as error:
-        raise ValueError(f"Cannot read {str(path)!r}: {' '.join(str(error).split())}") from error
 
 
 def load_finished(folder: Path) -> LoadedStudy:

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.text import Text
 
 import samplers
 from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
+from rare_envs.plugins import clean_text
 from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate
 from rare_envs.study.failures import KIND_DESCRIPTIONS
@@ -229,6 +231,14 @@ def name_measure(name: str) -> str:
     return f"{name} [{measure.unit}]" if measure.unit else name
 
 
+class CleanConsole(Console):
+    """A terminal that shows text clean; markup is to be off, as which P[f <= 0] would be read."""
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        """Return a text to show."""
+        return super().render_str(clean_text(text), **how)
+
+
 N_UNUSUAL = 3
 """Parameters of the most likely failure that are named at most."""
 NAMED_SHARE = 1e-4
@@ -243,8 +253,7 @@ Row = tuple[str, str]
 
 def print_report(report: Report, out: Path | None = None, details: bool = False) -> None:
     """Print the number, what it rests on, the most likely failure, and where the files are; with details everything."""
-    # markup off: P[f <= 0] and what warnings quote would be read as tags
-    console = Console(highlight=False, soft_wrap=True, markup=False)
+    console = CleanConsole(highlight=False, soft_wrap=True, markup=False)
     estimate, question = report.estimate, report.study.question
     odds = f" (1 in {1 / estimate.p:,.0f} scenarios)" if 0 < estimate.p < 0.1 else ""
     average = f", {report.average}" if report.average else ""

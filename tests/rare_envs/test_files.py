@@ -1,4 +1,4 @@
-"""A file is replaced whole or not at all, whatever stops the writing."""
+"""A file is replaced whole or not at all, whatever stops the writing, and read only where its size is bounded."""
 
 from __future__ import annotations
 
@@ -7,11 +7,33 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from rare_envs.files import MAX_TEXT_BYTES, read_text_file, replace_file, replace_text
+import samplers
+from agents import load_driver, load_ego
+from agents.saved_ego import load_statistics
+from rare_envs.files import (
+    MAX_MEMBERS,
+    MAX_VALUES,
+    digest_file,
+    parse_json_object,
+    read_members,
+    read_rows,
+    read_text_file,
+    replace_file,
+    replace_text,
+)
+from rare_envs.scenarios import scenario_named
+from rare_envs.scenarios.base import load_base
+from rare_envs.study.arguments import BadInput, read_question_file
+from rare_envs.study.html_report import read_recorded_events
+from training.checkpoints import read_checkpoint
+from training.data import load_ngsim
 
 
 def names(folder: Path) -> list[str]:
@@ -78,19 +100,54 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
         assert text == number * 200_000
 
 
+READERS: dict[str, Callable[[Path], Any]] = {
+    "text": read_text_file,
+    "rows": read_rows,
+    "archive": read_members,
+    "digest": digest_file,
+    "drivers": load_driver,
+    "ego": load_ego,
+    "statistics": lambda path: load_statistics(path, None, trust=True),
+    "base": lambda path: load_base(scenario_named("cut_in"), path),
+    "question": read_question_file,
+    "events": lambda path: read_recorded_events(path, ["gap"]),
+    "checkpoint": lambda path: read_checkpoint(path, ()),
+    "recording": load_ngsim,
+    "result": samplers.Estimate.load,
+}
+"""What reads a file that somebody else may have written."""
+REFUSED = (ValueError, BadInput)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_only_ordinary_files_of_a_bounded_size_are_read(tmp_path: Path) -> None:
-    pipe, large, text = tmp_path / "pipe", tmp_path / "large", tmp_path / "text"
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_a_device_and_an_enormous_file_are_refused_at_once(name: str, tmp_path: Path) -> None:
+    pipe, device, enormous = (tmp_path / f"{kind}.safetensors" for kind in ("pipe", "device", "enormous"))
     os.mkfifo(pipe)
-    (tmp_path / "zero").symlink_to("/dev/zero")
-    text.write_text("été", encoding="utf-8")
-    large.touch()
-    os.truncate(large, MAX_TEXT_BYTES + 1)
-    assert read_text_file(text) == "été"
-    for path in (pipe, tmp_path / "zero", tmp_path):
-        with pytest.raises(ValueError, match="is no ordinary file"):
-            read_text_file(path)
-    with pytest.raises(ValueError, match="268,435,457 bytes, more than 268,435,456"):
-        read_text_file(large)
-    with pytest.raises(FileNotFoundError):
-        read_text_file(tmp_path / "nowhere")
+    device.symlink_to("/dev/zero")
+    enormous.touch()
+    os.truncate(enormous, 40 * 2**30)
+    for path in (pipe, device):
+        with pytest.raises(REFUSED, match=r"no ordinary file|Cannot take up"):
+            READERS[name](path)
+    if name == "digest":  # which is of both ends
+        return
+    with pytest.raises(REFUSED, match=r"42,949,672,960 bytes|not a zip|65,536 letters|Cannot take up"):
+        READERS[name](enormous)
+
+
+def test_what_unpacks_to_far_more_than_its_size_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "archive.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(MAX_MEMBERS + 1):
+            archive.writestr(str(number), b"")
+    with pytest.raises(ValueError, match="more than 10,000 members"):
+        read_members(path)
+    for text in ("[" + "[]," * MAX_VALUES, '{"a": 1' + ',"a":1' * MAX_VALUES):
+        with pytest.raises(ValueError, match="the file has more than 1,000,000 values"):
+            parse_json_object(text, "the file")
+    path.write_text("," * MAX_VALUES + "\n")
+    with pytest.raises(ValueError, match="more than 1,000,000 cells"):
+        read_rows(path)
+    path.write_bytes("\ufeffété".encode())
+    assert read_text_file(path) == "été"

@@ -5,6 +5,7 @@ Errors name the file and the line, counted from 1 as editors do.
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,12 +18,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
+from rare_envs.files import open_ordinary
 from samplers.problem import FloatArray
 
 Gaps = Literal["error", "cut"]
 
 CHUNK, LARGEST_DOCUMENT = 1 << 24, 1 << 28
 """Characters of JSON read at a time (documents have 1e4 to 1e6), and after which one that does not end is broken."""
+LONGEST_LINE = 2**16
+"""Characters of a line."""
 FASTEST_SPEED = 70.0
 """Speed [m/s] above which (252 km/h) units are taken to be wrong, or tracking to be broken."""
 FASTEST_JUMP = 100.0
@@ -96,15 +100,23 @@ class Rows:
 def read_header(path: Path) -> list[str]:
     """Return the fields of the first line; a ValueError if the file cannot be read or is empty."""
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            header = [name.strip().strip('"') for name in file.readline().split(",")]
+        header = [name.strip().strip('"') for name in next(_lines(path), "").split(",")]
     except UnicodeDecodeError:
         raise ValueError(f"Cannot read {path}: it is no text, and CSV or text was expected.") from None
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
     if header == [""]:
         raise ValueError(f"{path} is empty.")
     return header
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text of bounded length, whatever stands in the place of the file."""
+    with io.TextIOWrapper(open_ordinary(path), encoding="utf-8-sig") as file:
+        while line := file.readline(LONGEST_LINE):
+            if len(line) == LONGEST_LINE:
+                raise ValueError(f"a line has {LONGEST_LINE:,} letters or more.")
+            yield line
 
 
 def read_table(path: Path, columns: ColumnMap, leave_out_empty: bool = False) -> Rows:
@@ -154,7 +166,7 @@ def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None
     if matrix is None:
         delimiter = "," if len(read_header(path)) > 1 else None
         try:
-            matrix = np.loadtxt(path, ndmin=2, delimiter=delimiter)
+            matrix = np.loadtxt(_lines(path), ndmin=2, delimiter=delimiter)
         except (OSError, ValueError) as error:
             raise ValueError(f"Cannot read {path}: {error}") from None
     if matrix.shape[1] != size:
@@ -201,7 +213,7 @@ def _documents(path: Path) -> Iterator[Mapping[str, Any]]:
     """Yield the objects of a JSON array one by one, without holding the file in memory."""
     decoder, place = json.JSONDecoder(), 1
     try:
-        with path.open(encoding="utf-8") as file:
+        with io.TextIOWrapper(open_ordinary(path), encoding="utf-8") as file:
             text = file.read(CHUNK).lstrip()
             if not text.startswith("["):
                 raise ValueError(f"{path} is no JSON array; expected a file of I-24 MOTION, unpacked.")

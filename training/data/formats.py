@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from rare_envs.files import open_ordinary
 from samplers.problem import FloatArray
 from training.data.columns import (
+    LONGEST_LINE,
     Column,
     Gaps,
     Rows,
@@ -287,6 +289,7 @@ def load_coifman_li(path: Path | str, *, length: float = MEAN_LENGTH, gaps: Gaps
 def _read_mat(path: Path) -> FloatArray:
     """Return the matrix `data` of a MATLAB file."""
     try:
+        open_ordinary(path).close()
         data = np.asarray(loadmat(path, variable_names=["data"]).get("data"))
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError, zlib.error) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
@@ -383,11 +386,11 @@ def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:
         return (path,)
 
     def holds_positions(file: Path) -> bool:
-        with file.open("rb") as lines:
-            first = lines.readline().lower()
+        with open_ordinary(file) as lines:
+            first = lines.readline(LONGEST_LINE).lower()
         return any(name.encode() in first for name in wanted)
 
-    found = tuple(file for file in sorted(path.glob("*.csv")) if holds_positions(file))
+    found = tuple(file for file in sorted(path.glob("*.csv")) if file.is_file() and holds_positions(file))
     if not found:
         raise ValueError(f"{path} has no CSV file with a column {wanted[0]}; is it a folder with files of TGSIM?")
     return found

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from rare_envs.files import open_parquet
 from samplers.problem import FloatArray
 
 Integers = NDArray[np.int64]
@@ -183,10 +182,8 @@ def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
             "no part of the package; recordings of your own are read in the formats of docs/data.md."
         )
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise ValueError(f"Cannot read {path}: {error}") from None
+    with open_parquet(path) as file:
+        table = file.read()
     if missing := [name for name in names if name not in table.column_names]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
     return {name: table[name].to_numpy() for name in names}

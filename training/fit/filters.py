@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pyarrow import ArrowInvalid, csv
+from pyarrow import csv
 
 from rare_envs.distributions.events import EventCounts
 from rare_envs.distributions.space import Parameter
+from rare_envs.files import open_ordinary
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 from training.data.events import ANSWERS
@@ -127,8 +128,9 @@ def recorded_parameters(scenario: str, least_gap: float = LEAST_ACCEPTED_GAP) ->
 def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Return columns of a CSV file; a ValueError if it cannot be read or lacks one."""
     try:
-        table = csv.read_csv(path)
-    except (OSError, ArrowInvalid) as error:
+        with open_ordinary(path) as file:
+            table = csv.read_csv(file)
+    except (OSError, ValueError) as error:
         raise ValueError(f"Cannot read events from {path}: {error}.") from None
     if missing := [name for name in names if name not in table.column_names]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")

@@ -20,7 +20,7 @@ import torch
 from agents import LearnedDriver, Provenance, save_driver
 from agents.learned.networks import Policy
 from rare_envs.devices import find_device
-from rare_envs.files import replace_text
+from rare_envs.files import parse_json_object, read_text_file, replace_text
 from rare_envs.startup import advise_install
 from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
@@ -319,7 +319,7 @@ def claim_folder(out: Path, source: Source, config: Config) -> Iterator[None]:
     if out.exists() and not out.is_dir():
         raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
     begun, noted = any((out / name).exists() for name in (CHECKPOINT, DRIVER)), out / SETTINGS_FILE
-    if begun and noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != json.loads(text):
+    if begun and noted.exists() and parse_json_object(read_text_file(noted), repr(str(noted))) != json.loads(text):
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
     yield
     try:
@@ -334,7 +334,7 @@ def read_training_settings(folder: Path) -> tuple[Source, Config]:
     path = folder / SETTINGS_FILE
     if not path.is_file():
         raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS_FILE}.")
-    noted = json.loads(path.read_text(encoding="utf-8"))
+    noted = parse_json_object(read_text_file(path), repr(str(path)))
     for part in noted.values():  # JSON has lists
         part |= {name: tuple(value) for name, value in part.items() if isinstance(value, list)}
     return Source(**{**noted["source"], "path": Path(noted["source"]["path"])}), Config(**noted["config"])

@@ -34,7 +34,7 @@ from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import RADIUS, WEIGHT_NAMES, WeightDistribution, head_weights
-from rare_envs.files import replace_file
+from rare_envs.files import open_ordinary, replace_file
 from rare_envs.startup import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
@@ -131,7 +131,7 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
             member = train_member(data, driver, base, folder / CHECKPOINT, ensemble, number)
             with replace_file(path) as draft:
                 np.savez(draft, base=own, weights=member.weights, within=member.within)
-        with np.load(path) as saved:
+        with open_ordinary(path) as file, np.load(file) as saved:
             if not np.array_equal(saved["base"], own):
                 raise ValueError(f"{str(path)!r} is a member around another driver; remove {str(kept)!r}.")
             members.append(Member(saved["weights"], saved["within"]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -212,7 +211,7 @@ def serve_ego_command(
             raise ValueError(f"Expected an ego with predict, got {ego!r}, which needs more than observations.")
         server = EgoServer(loaded, bind, read_secret(), name=ego)
     with server:
-        print(f"Serving {ego} at {server.address}; stop with Ctrl-C.", file=sys.stderr, flush=True)
+        shell.print_stderr(f"Serving {ego} at {server.address}; stop with Ctrl-C.")
         server.run()
 
 

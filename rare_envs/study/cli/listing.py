@@ -33,7 +33,7 @@ from rare_envs.scenarios.registry import (
 from rare_envs.sensors.camera import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
 from rare_envs.study.arguments import BadInput
-from rare_envs.study.text import format_rate
+from rare_envs.study.text import CleanConsole, format_rate
 
 TICK = 0.1
 """[s], the usual one."""
@@ -111,7 +111,7 @@ def _first_line(documented: object) -> str:
 
 def print_overview(entries: dict[str, Any]) -> None:
     """Print all names that `list_names` returns, without their meanings: a screen of 80 columns and 24 lines."""
-    console = Console(highlight=False, markup=False)
+    console = CleanConsole(highlight=False, markup=False)
     environments = {"environments": "parameters"}
     for env_id, environment in entries["environments"].items():
         added = environment["of_learned_drivers"] if environment["drivers"] else []
@@ -146,7 +146,7 @@ def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
 
 def print_details(chosen: dict[str, Any]) -> None:
     """Print names that `choose_entries` returns with their meanings."""
-    console = Console(highlight=False, markup=False)
+    console = CleanConsole(highlight=False, markup=False)
     for env_id, environment in chosen.get("environments", {}).items():
         _print_parameters(console, env_id, environment["parameters"])
         added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
@@ -193,7 +193,7 @@ def list_bases(scenario: str) -> tuple[str, dict[str, dict[str, Any]]]:
 
 def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
     """Print what `list_bases` returns for an environment, a few lines each."""
-    console = Console(highlight=False, soft_wrap=True, markup=False)
+    console = CleanConsole(highlight=False, soft_wrap=True, markup=False)
     console.print(f"base distributions of {env_id}")
     for number, (name, base) in enumerate(bases.items()):
         console.print(f"{name}{'   (the default)' if number == 0 else ''}", style="bold")

@@ -23,7 +23,7 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from rare_envs.plugins import EgoGone
+from rare_envs.plugins import EgoGone, clean_text
 from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
 from rare_envs.study.arguments import BadInput, ExecutorOptions, Question, option_name, read_whole
 
@@ -101,7 +101,7 @@ class OneLineErrors(SummarisedCommands):
             pass
         if not ended:
             number = signal.Signals(received[0] if received else signal.SIGINT)
-            _print_stderr(f"rare-envs: stopped by {number.name}")
+            print_stderr(f"rare-envs: stopped by {number.name}")
             code = 128 + number
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -164,7 +164,7 @@ def one_line_warnings() -> Iterator[None]:
     """Print warnings in one line."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        _print_stderr("rare-envs: " + " ".join(str(message).split()))
+        print_stderr("rare-envs: " + " ".join(str(message).split()))
 
     before = warnings.showwarning
     warnings.showwarning = show
@@ -174,15 +174,15 @@ def one_line_warnings() -> Iterator[None]:
         warnings.showwarning = before
 
 
-def _print_stderr(line: str) -> None:
+def print_stderr(line: str) -> None:
     """Print a line on standard error, if there still is anybody to read it."""
     with contextlib.suppress(OSError, ValueError):
-        print(line, file=sys.stderr, flush=True)
+        print(clean_text(line), file=sys.stderr, flush=True)
 
 
 def _fail(message: str) -> NoReturn:
     """Print an error in one line, and exit."""
-    _print_stderr("rare-envs: " + " ".join(message.split()))
+    print_stderr("rare-envs: " + " ".join(message.split()))
     sys.exit(2)
 
 
@@ -204,7 +204,7 @@ class Answer(NamedTuple):
         try:
             with defer_signals():
                 if as_json or isinstance(self.text, str):
-                    print(json.dumps(self.data, indent=2, allow_nan=False) if as_json else self.text)
+                    print(json.dumps(self.data, indent=2, allow_nan=False) if as_json else clean_text(str(self.text)))
                 else:
                     self.text()
                 whole = True
@@ -221,7 +221,7 @@ def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
         print_report(report, out, details)
         if not details:
             where = "--details" if out is None else f"rare-envs report {shlex.quote(str(out))}"
-            print(f"all intervals and parameters: {where}")
+            print(clean_text(f"all intervals and parameters: {where}"))
 
     doubtful = DOUBTFUL if report.doubtful else 0
     return Answer(report.to_dict(), show, doubtful if report.verdict is None else GATE_CODES[report.verdict.decision])
@@ -236,7 +236,7 @@ def answering(work: Callable[[], Answer | None], as_json: bool, stopped: str, de
         report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
         # whoever ended the process may not wait for more than one line
         if isinstance(error, KeyboardInterrupt) and (hasattr(error, "report") or stopped):
-            _print_stderr(str(error) if hasattr(error, "report") else stopped)
+            print_stderr(str(error) if hasattr(error, "report") else stopped)
         if report is not None:
             (report if isinstance(report, Answer) else describe_report(report, None, details)).print(as_json)
         raise

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+from rare_envs.study.text import CleanConsole
 
 MEASUREMENTS = ("driving", "latency")
 """Checks whose result is of interest though it passed."""
@@ -48,17 +49,17 @@ def exit_code(findings: list[Finding]) -> int:
 
 def print_findings(findings: list[Finding], title: str, everything: bool = False) -> None:
     """Print findings with their remedies, and the verdict."""
-    table = Table("check", "", "found", "what to do", title=Text(title), title_justify="left", title_style="bold")
+    table = Table("check", "", "found", "what to do", title=title, title_justify="left", title_style="bold")
     passed = []
     for each in findings:
         if everything or each.status != "pass" or each.advice or each.check in MEASUREMENTS:
             status = Text(each.status, style=STYLES[each.status])
-            table.add_row(Text(each.check), status, Text(each.found), Text(each.advice))
+            table.add_row(each.check, status, each.found, each.advice)
         else:
             passed.append(each.check)
     if passed:
         count = f"{len(passed)} other{'s' if len(passed) > 1 else ''}"
-        table.add_row(Text(count), Text("pass", style=STYLES["pass"]), Text(", ".join(passed)), "")
-    console = Console(highlight=False)
+        table.add_row(count, Text("pass", style=STYLES["pass"]), ", ".join(passed), "")
+    console = CleanConsole(highlight=False, markup=False)
     console.print(table)
-    console.print(VERDICTS[exit_code(findings)], markup=False)
+    console.print(VERDICTS[exit_code(findings)])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import csv
 import io
 import re
 import shlex
@@ -19,8 +18,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from rare_envs.envs.rendering import CRASH_COLOUR, FRAME_WIDTH, ROLE_COLOURS
-from rare_envs.files import replace_text
-from rare_envs.plugins import EgoGone, one_line, reason_of
+from rare_envs.files import read_rows, replace_text
+from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import plots, text
 from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
@@ -55,19 +54,17 @@ class NearestEvent(NamedTuple):
 def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
     """Read events from a CSV file with a column for each of some parameters; others are not looked at."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        missing = [name for name in names if rows and name not in rows[0]]
+        header, *rows = read_rows(path) or [[]]
+        missing = [name for name in names if name not in header]
         if missing or not rows:
-            has = f"it has {', '.join(rows[0])}" if rows else "it has no rows"
-            raise BadInput(
-                f"Expected events in {str(path)!r} with columns named as the parameters, {', '.join(names)}; {has}."
-            )
-        values = np.array([[float(row[name] or "nan") for name in names] for row in rows])
+            has = f"it has {', '.join(header)}" if rows else "it has no rows"
+            raise ValueError(f"expected columns named as the parameters, {', '.join(names)}; {has}")
+        places = [header.index(name) for name in names]
+        values = np.array([[float(row[place] or "nan") for place in places] for row in rows])
     except OSError as error:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
-    except (ValueError, TypeError, csv.Error) as error:
-        raise BadInput(f"{str(path)!r} is no table of events: {error}.") from error
+    except (ValueError, IndexError) as error:
+        raise BadInput(f"{str(path)!r} is no table of events: {str(error).rstrip('.')}.") from error
     known: FloatArray = values[np.isfinite(values).all(axis=1)]
     if not len(known):
         raise BadInput(f"{str(path)!r} has no event with all of {', '.join(names)}.")
@@ -245,7 +242,7 @@ def render_page(
         lstrip_blocks=True,
         finalize=_keep_numbers_whole,
     )
-    return environment.get_template("report.html.j2").render(
+    page = environment.get_template("report.html.j2").render(
         result=result,
         question=result.get("question") or {},
         base=base if isinstance(base, dict) else None,
@@ -273,6 +270,7 @@ def render_page(
         with_interval=text.format_with_interval,
         roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
     )
+    return clean_text(page)
 
 
 NOTED = ("warnings", "remarks", "notes")

@@ -10,14 +10,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rare_envs.files import replace_file
-from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE, draw_convergence
+from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, draw_convergence, drawing, show_literally
 from rare_envs.study.text import Result
 from samplers.problem import FloatArray
 
@@ -49,7 +48,7 @@ class FigureOfPage:
 
     def _make_svg(self) -> str:
         buffer = io.StringIO()
-        with matplotlib.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": self.name}):
+        with drawing(**{"svg.fonttype": "none", "svg.hashsalt": self.name}):
             self._make().savefig(buffer, format="svg", metadata={"Date": None})
         text = buffer.getvalue()
         text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
@@ -66,13 +65,14 @@ class FigureOfPage:
     def save(self, folder: Path, kind: str) -> Path:
         """Save it as a file of a folder, and return its path."""
         path = folder / f"{self.name}.{kind}"
-        with matplotlib.rc_context(STYLE), replace_file(path) as draft:
+        with drawing(), replace_file(path) as draft:
             self._make().savefig(draft, dpi=150)
         return path
 
     def _make(self) -> Figure:
         figure = Figure(figsize=self._size, layout="constrained")
         self._draw(figure)
+        show_literally(figure)
         return figure
 
 

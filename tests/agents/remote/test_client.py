@@ -16,13 +16,14 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+import zmq
 from gymnasium import spaces
 
 import rare_envs
 from agents import load_ego
 from agents.remote import protocol
 from agents.remote.client import LinkError, RemoteEgo, RemoteError, ServerLink, connect, parse_address
-from agents.remote.protocol import derive_server_keys
+from agents.remote.protocol import MalformedMessage, derive_server_keys
 from agents.remote.server import EgoServer, RequestHandler, is_loopback
 from rare_envs.plugins import EgoGone, NoAnswer
 from samplers.evaluate import Evaluator
@@ -115,7 +116,7 @@ def test_a_server_that_answers_nonsense_is_a_fault(serve: Any, connect_ego: Any)
         with pytest.raises(RemoteError, match="failed twice on this batch"):
             there.predict(np.zeros((1, 7), np.float32))
     said.append(msgpack.packb({"type": "error", "code": 3, "reason": "\x1b[31mred\n\r\x00", "id": None}))
-    with pytest.raises(RemoteError, match=r"^\[31mred$"):  # one line, without what steers a terminal
+    with pytest.raises(RemoteError, match=r"^\\x1b\[31mred \\x00$"):  # what steers a terminal is shown
         there.predict(np.zeros((1, 7), np.float32))
 
 
@@ -231,6 +232,26 @@ def test_a_broken_connection_and_silence_are_told_apart(serve: Any) -> None:
     with pytest.raises(LinkError, match="the connection broke"):
         link.request(b"", 10.0)
     link.close()
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_INFO"), reason="the system does not count what a connection brings")
+def test_an_answer_without_an_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ keeps the frames of an answer until the last one, however many there are."""
+    monkeypatch.setattr(protocol, "MAX_ANSWER_BYTES", 2**16)
+    router = zmq.Context.instance().socket(zmq.ROUTER)
+    link = ServerLink(f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
+
+    def answer() -> None:
+        router.send_multipart([router.recv_multipart()[0], b"", *[bytes(2**15)] * 40])
+
+    link.open()
+    server = threading.Thread(target=answer)
+    server.start()
+    with pytest.raises(MalformedMessage, match="an answer of more than 65,536 bytes"):
+        link.request(b"", 30.0)
+    server.join()
+    link.close()
+    router.close(0)
 
 
 def test_a_port_at_which_nothing_listens_is_said_in_a_second_and_waited_for(serve: Any) -> None:
