@@ -23,7 +23,7 @@ from agents.vision import load_vision
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.needs import RULE_BASED_EGOS, wrap_callable
-from rare_envs.plugins import EgoGone, did_you_mean, import_object, is_policy, one_line, refuse_ego
+from rare_envs.plugins import EgoGone, as_errors, did_you_mean, import_object, is_policy, one_line, refuse_ego
 from rare_envs.startup import advise_install
 
 EGO_NAMES = (*RULE_BASED_EGOS, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
@@ -208,8 +208,9 @@ def _call_factory(spec: str, *_: Any) -> Any:
     if not callable(function):
         raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
     try:
-        ego = wrap_callable(function())
-    except (Exception, SystemExit) as error:  # the function is the user's: anything may happen in it
+        with as_errors():
+            ego = wrap_callable(function())
+    except Exception as error:  # the function is the user's: anything may happen in it
         raise ValueError(f"{spec!r}, called without arguments, failed to make an ego: {one_line(error)}.") from error
     rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
     if not rule_based and not is_policy(ego):

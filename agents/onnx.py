@@ -7,7 +7,9 @@ squashed or clipped action and a recurrent policy's memory are part of the graph
 from __future__ import annotations
 
 import json
+import re
 import warnings
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +29,23 @@ from rare_envs.startup import advise_install
 
 METADATA_KEY = "rare_envs"
 """Entry of a file's metadata in which `export_onnx` describes observations and actions."""
-_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+_TYPES = {
+    "tensor(float)": np.float32,
+    "tensor(double)": np.float64,
+    "tensor(float16)": np.float16,
+    "tensor(uint8)": np.uint8,
+}
+_MASK_TYPES = {**_TYPES, "tensor(bool)": np.bool_, "tensor(int8)": np.int8, "tensor(int64)": np.int64}
+_MASK = re.compile(r"action_masks?")
+"""Inputs that say which actions are allowed, in files of ML-Agents and sb3-contrib."""
+_ACTIONS = re.compile(r"(.*[_.])?actions?", re.IGNORECASE)
+"""Names of actions, in files of Stable-Baselines3, ML-Agents and Isaac Lab."""
+_TURNS = {"next", "new", "prev", "previous", "in", "out", "ins", "outs", "input", "output"}
+"""Words by which the names of a memory before and after a tick differ."""
+_LEAST_PIXELS = 16
+"""A shorter first axis of three is that of colours, if the others are no shorter."""
+_TRIED_SIZES = (2, 3)
+"""Batches on which a file is tried when it is read; one that takes both takes any."""
 ACTION_TOLERANCE = 1e-5
 """Largest difference between actions of the policy and of its export: single precision rounds by about 1e-7 in each of
 a few layers."""
@@ -40,15 +58,16 @@ TRIAL_RANGE = 10.0
 class OnnxEgo:
     """A policy in an ONNX file, run by onnxruntime on the CPU.
 
-    The first input is the observations, shape (B, ...), float or double. The first output is the actions: (B, 2) in
-    [-1, 1] (acceleration and steering, clipped by the environment), (B,) or (B, 1) integers, or (B, 5) scores of which
-    the best counts. Further inputs are a memory, as many as there are further outputs, in the same order: each of
-    shape (B, ...), zeros at the start of an episode, then what the output of the tick before was. A batch size that
-    the file fixes at 1 is respected, row by row.
+    The observations are the input named obs..., else the first: shape (B, ...), of pictures with the channels first or
+    last. The actions are the output named so, else the first of their form: (B, 2) in [-1, 1] (acceleration and
+    steering, clipped by the environment), (B,) or (B, 1) integers, or (B, 5) scores of which the best counts. Further
+    inputs are a memory, and so are the outputs of like names, or else as many further outputs in the same order: zeros
+    at the start of an episode, then what the output of the tick before was. Masks of actions allow all. Other outputs,
+    such as values, are left alone. A batch size that the file fixes is kept to, in portions.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the file, and refuse a graph of another form."""
+        """Read the file and try it on blank observations; refuse a graph of another form."""
         if not path.exists():
             raise report_missing_file(path)
         open_ordinary(path, MAX_NETWORK_BYTES).close()
@@ -58,32 +77,31 @@ class OnnxEgo:
             raise ValueError(f"{str(path)!r} needs onnxruntime: {advise_install('onnx')}.") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
+        options.log_severity_level = 4  # its errors are raised, too
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own exceptions have no common class
             raise ValueError(f"Cannot load {str(path)!r} as ONNX: {one_line(error)}.") from error
-        self.path = path
-        self._inputs, self._outputs = self._session.get_inputs(), self._session.get_outputs()
-        if not self._inputs or len(self._inputs) != len(self._outputs):
-            got = " and ".join(str([port.name for port in ports]) for ports in (self._inputs, self._outputs))
-            raise ValueError(
-                f"Expected {str(path)!r} to have one input (observations) and one output (actions), and after them a "
-                f"memory, as many inputs as outputs; got {got}."
-            )
-        for port in self._inputs:
-            if port.type not in _TYPES or not port.shape or any(not isinstance(size, int) for size in port.shape[1:]):
-                raise ValueError(
-                    f"Expected input {port.name!r} of {str(path)!r} to be float or double of shape "
-                    f"(batch, fixed sizes), got {port.type} {port.shape}."
-                )
-        batch, *shape = self._inputs[0].shape
-        self.fixed_batch: int | None = batch if isinstance(batch, int) else None
-        self.observation_space = spaces.Box(-np.inf, np.inf, tuple(shape), np.float32)  # the file tells no bounds
+        self.path, inputs, outputs = path, self._session.get_inputs(), self._session.get_outputs()
+        self._masks = [port for port in inputs if _MASK.fullmatch(port.name)]
+        inputs = [port for port in inputs if port not in self._masks]
+        if not inputs or not outputs:
+            raise ValueError(f"Expected {str(path)!r} to have an input (observations) and an output (actions).")
+        self._inputs = sorted(inputs, key=lambda port: not port.name.lower().startswith("obs"))
+        batch = next(iter(self._inputs[0].shape), None)
+        self._axes = [_find_batch_axis(port, batch, path) for port in self._inputs]
+        actions = _choose_actions(outputs)
+        self._outputs = [actions, *_pair_memory(self._inputs[1:], [port for port in outputs if port != actions], path)]
+        self.fixed_batch: int | None = None
+        self._tried = self._try_sizes(batch)
+        shape = self._blank(0)[0].shape[1:]
+        self._channels_first = len(shape) == 3 and shape[0] < _LEAST_PIXELS <= min(shape[1:])
+        shape = (*shape[1:], shape[0]) if self._channels_first else shape
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float32)  # the file tells no bounds
 
     @cached_property
     def action_space(self) -> spaces.Space[Any] | None:
-        """Space of one action, as `export_onnx` described it or by five scores; None if the file does not tell."""
+        """Space of one action, as `export_onnx` described it or by its form; None if the file does not tell."""
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
         try:
             action = json.loads(text)["action"]
@@ -91,7 +109,19 @@ class OnnxEgo:
                 return spaces.Discrete(int(action["n"]))
             return spaces.Box(np.float32(action["low"]), np.float32(action["high"]), dtype=np.float32)
         except (ValueError, TypeError, KeyError):  # a file from elsewhere
-            return spaces.Discrete(len(DISCRETE_ACTIONS)) if _are_scores(self._outputs[0].shape) else None
+            if _are_scores(self._tried.shape):
+                return spaces.Discrete(len(DISCRETE_ACTIONS))
+            numbers = self._tried.dtype.kind == "f"
+            return spaces.Box(-np.inf, np.inf, self._tried.shape[1:], np.float32) if numbers else None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which output is taken as the actions where there are others than a memory, and what masks are."""
+        file, taken = self.path.name, [port.name for port in self._outputs]
+        others = [port.name for port in self._session.get_outputs() if port.name not in taken]
+        chosen = f"the output {taken[0]!r} of {file} is taken as the actions, not {', '.join(map(repr, others))}"
+        masks = [f"the input {port.name!r} of {file} allows every action" for port in self._masks]
+        return (*([chosen] if others else []), *masks)
 
     def predict(
         self,
@@ -102,9 +132,9 @@ class OnnxEgo:
     ) -> tuple[NDArray[Any], Any]:
         """Choose an action for each row of a batch; see `agents.Ego.predict`. The graph is always deterministic."""
         observation = np.asarray(observation)
-        memory = (
-            [np.zeros((len(observation), *port.shape[1:])) for port in self._inputs[1:]] if state is None else state
-        )
+        if self._channels_first:
+            observation = np.moveaxis(observation, -1, 1)
+        memory = self._blank(len(observation))[1:] if state is None else state
         if state is not None and episode_start is not None and np.any(episode_start):
             anew = np.asarray(episode_start, dtype=bool)
             memory = [np.where(anew.reshape(-1, *[1] * (part.ndim - 1)), 0, part) for part in memory]
@@ -115,6 +145,30 @@ class OnnxEgo:
             action = action.argmax(axis=1)
         return action, tuple(memory) or None
 
+    def _blank(self, rows: int) -> list[NDArray[Any]]:
+        """Return inputs of zeros for so many rows, which are along the first axis."""
+        shapes = [[size for at, size in enumerate(port.shape) if at != axis] for port, axis in self._ports]
+        return [np.zeros((rows, *shape)) for shape in shapes]
+
+    @property
+    def _ports(self) -> Iterator[tuple[Any, int]]:
+        """The inputs, each with the axis of its rows."""
+        return zip(self._inputs, self._axes, strict=True)
+
+    def _try_sizes(self, batch: Any) -> NDArray[Any]:
+        """Find the batch size that the file fixes, if any, and return actions; refuse a file that answers to none."""
+        declared = [size for port in self._outputs for size in port.shape[:1] if isinstance(size, int)]
+        fixed = [batch] if isinstance(batch, int) else [None, *declared, 1]
+        first: Exception | None = None
+        for self.fixed_batch in fixed:
+            try:
+                for size in _TRIED_SIZES:
+                    action, *_ = self._run(self._blank(size))
+                return action
+            except Exception as error:  # likewise
+                first = first or error
+        raise ValueError(f"Cannot run {str(self.path)!r} on a batch of blank observations: {one_line(first)}.")
+
     def _run(self, values: list[NDArray[Any]]) -> list[NDArray[Any]]:
         """Return the outputs for all rows, in portions if the file fixes the batch size; the last row fills up."""
         rows = len(values[0])
@@ -123,11 +177,65 @@ class OnnxEgo:
         for first in range(0, max(rows, 1), max(size, 1)):
             taken = np.arange(first, first + size).clip(max=rows - 1)
             feed = {
-                port.name: np.ascontiguousarray(value[taken], _TYPES[port.type])
-                for port, value in zip(self._inputs, values, strict=True)
+                port.name: np.ascontiguousarray(np.moveaxis(value[taken], 0, axis), _TYPES[port.type])
+                for value, (port, axis) in zip(values, self._ports, strict=True)
             }
-            portions.append(self._session.run(None, feed))
+            feed |= {port.name: np.ones((size, *port.shape[1:]), _MASK_TYPES[port.type]) for port in self._masks}
+            parts = self._session.run([port.name for port in self._outputs], feed)
+            portions.append(
+                [np.moveaxis(part, axis, 0) for part, axis in zip(parts, (0, *self._axes[1:]), strict=True)]
+            )
+            for port, part in zip(self._outputs, portions[-1], strict=True):
+                if len(part) != size:
+                    raise ValueError(f"the output {port.name!r} has shape {part.shape} for {size} rows")
         return [np.concatenate(parts)[:rows] for parts in zip(*portions, strict=True)]
+
+
+def _find_batch_axis(port: Any, batch: Any, path: Path) -> int:
+    """Return the axis of an input along which its rows are, the one of no fixed size, if any; else a ValueError."""
+    free = [axis for axis, size in enumerate(port.shape) if not isinstance(size, int)]
+    if not free:
+        free = [axis for axis, size in enumerate(port.shape[:2]) if size == (batch if isinstance(batch, int) else 1)][
+            :1
+        ]
+    if port.type not in _TYPES or len(port.shape) < 2 or len(free) != 1:
+        raise ValueError(
+            f"Expected input {port.name!r} of {str(path)!r} to be numbers of shape (batch, fixed sizes), got "
+            f"{port.type} {port.shape}."
+        )
+    return free[0]
+
+
+def _choose_actions(outputs: Sequence[Any]) -> Any:
+    """Return the output that has the actions: the one named so (means before draws), else the first of their form."""
+    named = [port for port in outputs if _ACTIONS.fullmatch(port.name)]
+    named.sort(key=lambda port: "deterministic" not in port.name)
+
+    def fits(port: Any) -> bool:
+        sizes = list((port.shape or [])[1:])
+        return sizes in ([], [1]) if "int" in port.type else sizes == [2] or _are_scores(port.shape or [])
+
+    return (named or list(filter(fits, outputs)) or list(outputs))[0]
+
+
+def _pair_memory(inputs: Sequence[Any], outputs: Sequence[Any], path: Path) -> list[Any]:
+    """Return the outputs that inputs of a memory come from, by their names but for "next", say, or by their order."""
+    by_name = {_name_part(port): port for port in outputs}
+    found = [by_name.get(_name_part(port)) for port in inputs]
+    if None not in found:
+        return found
+    if len(inputs) != len(outputs):
+        names = " and ".join(str([port.name for port in ports]) for ports in (inputs, outputs))
+        raise ValueError(
+            f"Expected {str(path)!r} to have one input (observations) and one output (actions), and after them a "
+            f"memory, as many inputs as outputs or of like names; got {names} beside the first."
+        )
+    return list(outputs)
+
+
+def _name_part(port: Any) -> tuple[str, ...]:
+    """Return the words of a name of a memory, without those that tell its input and output apart."""
+    return tuple(word for word in re.split(r"[^a-z0-9]+", port.name.lower()) if word not in _TURNS)
 
 
 def _are_scores(shape: Any) -> bool:

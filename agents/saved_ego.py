@@ -7,10 +7,9 @@ that needs classes of its author's own is opened as Stable-Baselines3 does, and 
 from __future__ import annotations
 
 import base64
-import pickle
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
@@ -36,10 +35,14 @@ _MAX_STATISTICS = 2**26
 """Largest file of statistics [bytes]."""
 _NAMES = ("vecnormalize", "vec_normalize")
 """Names of files of statistics: Stable-Baselines3's callbacks and RL Zoo write the first, its examples the second."""
+LAST, ORIGINAL = "_last_obs", "_last_original_obs"
+"""Entries of a `.zip`: the last observations of its training, and such from before `VecNormalize`."""
 _BEYOND = 1e-3
 """Observations beyond the bounds by less are rounding."""
 _STEP = 0.5
 """A change of the observations of ordinary environments in one step is smaller; `VecNormalize` moves some by more."""
+OUTLYING = 5.0
+"""Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
 _MIN_ROWS, _SPREAD, _CENTRE = 16, (0.3, 3.0), 1.5
 """From so many rows on, a standard deviation in this range and a mean of at most so much in every column are those of
 normalised observations: some of the environment's own vary by far less."""
@@ -76,6 +79,8 @@ class SavedEgo:
     """The file of the statistics, or None."""
     header: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Settings of the file, their pickles closed."""
+    left_out: Path | None = None
+    """A file of statistics beside it that is not its own, by what its file says; None if there is none."""
 
     @property
     def observation_space(self) -> Any:
@@ -101,12 +106,24 @@ class SavedEgo:
             return self.policy
         return WrappedPolicy(self.policy, self.statistics.normalize_obs, *(self.frames or ()))
 
-    def find_missing_statistics(self, expected: Any) -> str:
-        """Return why it seems to lack statistics for an environment's space of observations; "" if it does not."""
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which statistics beside it are left out."""
+        if self.left_out is None:
+            return ()
+        why = "the ego's own file says that it was trained without VecNormalize"
+        return (f"{self.left_out} is not applied: {why}; --stats (load_ego(path, stats=FILE)) applies it",)
+
+    def find_normalisation_doubt(self, expected: Any) -> str:
+        """Return what is wrong with its statistics for an environment's space of observations; "" if nothing seems."""
         if self.statistics is not None:
-            return ""
-        last = _open_observation(self.header, "_last_obs")
-        return describe_missing_statistics(self.header, last, self.policy.observation_space, expected)
+            why = describe_foreign_statistics(self.header, self.statistics, self.policy.observation_space)
+            return f"the VecNormalize statistics {self.statistics_path} seem to be those of another ego: {why}" * bool(
+                why
+            )
+        last = _open_observation(self.header, LAST)
+        missing = describe_missing_statistics(self.header, last, self.policy.observation_space, expected)
+        return f"the ego has no VecNormalize statistics, but {missing}" * bool(missing)
 
     def predict(
         self,
@@ -146,8 +163,18 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
             f"Cannot load {str(path)!r} as {name.upper()} (saved by Stable-Baselines3 {header['version']}): "
             f"{one_line(error)}. The file is damaged, {contrib}, or holds another algorithm (name it with algo)."
         ) from error
-    statistics = None if statistics_path is None else load_statistics(statistics_path, policy.observation_space, trust)
-    return SavedEgo(policy, name, path, policy_kwargs, statistics, statistics_path, header)
+    ego = SavedEgo(policy, name, path, policy_kwargs, header=header)
+    if statistics_path is None:
+        return ego
+    try:
+        statistics = load_statistics(statistics_path, policy.observation_space, trust)
+    except ValueError:
+        if stats is not None or not saw_originals(header):
+            raise
+        return replace(ego, left_out=statistics_path)
+    if stats is None and saw_originals(header, statistics):
+        return replace(ego, left_out=statistics_path)
+    return replace(ego, statistics=statistics, statistics_path=statistics_path)
 
 
 # --- statistics of VecNormalize -------------------------------------------------------------------
@@ -181,10 +208,12 @@ def load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
     what = f"VecNormalize statistics {str(path)!r}"
     elsewhere = "move the file away if it does not belong to this ego"
     try:
-        content = read_bytes(path, _MAX_STATISTICS)
-        statistics = pickle.loads(content) if trust else open_pickle(content)
+        statistics = open_pickle(read_bytes(path, _MAX_STATISTICS), trust)
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"expected VecNormalize, got {type(statistics).__name__}")
+        # what it has not without an environment, or does not normalise: its class would look for these forever
+        vars(statistics).update(training=False, class_attributes={}, returns=np.zeros(1))
+        vars(statistics).setdefault("obs_rms", None)
         check_space(statistics.observation_space)
         theirs, ours = statistics.observation_space.shape or (), observation_space.shape or ()
         fits = find_stacking(theirs, ours) is not None
@@ -197,7 +226,6 @@ def load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
         raise ValueError(f"{what} are for observations of shape {theirs}, the ego's have {ours}; {elsewhere}.")
     if not whole:
         raise ValueError(f"{what} are damaged; save them again.")
-    statistics.training = False
     return statistics
 
 
@@ -233,13 +261,75 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
 
 def _has_original_observations(header: Mapping[str, Any], last: Any) -> bool:
     """Return whether a file keeps observations from before `VecNormalize`; with a replay buffer, by their scale."""
-    name = "_last_original_obs"
-    if header.get(name) is None or "learning_starts" not in header:
-        return header.get(name) is not None
-    original = _open_observation(header, name)
+    if header.get(ORIGINAL) is None or not _keeps_replays(header):
+        return header.get(ORIGINAL) is not None
+    original = _open_observation(header, ORIGINAL)
     if isinstance(original, dict) and isinstance(last, dict):
         return any(_is_rescaled(last[key], original[key]) for key in original.keys() & last.keys())
     return _is_rescaled(last, original)
+
+
+def _keeps_replays(header: Mapping[str, Any]) -> bool:
+    """Return whether an algorithm has a replay buffer: then it keeps original observations without `VecNormalize` too.
+
+    Of `VecNormalize` they are those of the last step, else of the one before; without a buffer, of the first step.
+    """
+    return "learning_starts" in header
+
+
+def saw_originals(header: Mapping[str, Any], statistics: Any = None) -> bool:
+    """Return whether a file says that its policy was trained on observations as they are, without `VecNormalize`.
+
+    With a replay buffer the last observations are then nearer to the original ones than to those behind statistics.
+    """
+    last = _open_observation(header, LAST)
+    if last is None or ORIGINAL not in header:  # never trained, or it does not tell
+        return False
+    if header[ORIGINAL] is None or not _keeps_replays(header):
+        return header[ORIGINAL] is None
+    original = _open_observation(header, ORIGINAL)
+    if _has_original_observations(header, last) or original is None:
+        return False
+    return statistics is None or _distance(last, original) < _distance(last, _normalise(original, statistics))
+
+
+def describe_foreign_statistics(header: Mapping[str, Any], statistics: Any, own: Any) -> str:
+    """Return why statistics seem not to be those of a policy with its own space, by its file; "" if nothing says so."""
+    if not statistics.norm_obs:
+        return ""
+    if saw_originals(header, statistics):
+        return "its file says that it was trained without VecNormalize"
+    theirs, last, original = (
+        statistics.observation_space,
+        *(_open_observation(header, name) for name in (LAST, ORIGINAL)),
+    )
+    if isinstance(own, spaces.Box) and isinstance(theirs, spaces.Box) and own.shape == theirs.shape and own != theirs:
+        return "they are of an environment whose observations have other bounds"
+    if original is None or last is None:
+        return ""
+    expected = _normalise(original, statistics)
+    if _keeps_replays(header) and _distance(last, expected) > _STEP:
+        return "they do not lead from the original to the last observations of its training"
+    if isinstance(expected, np.ndarray) and _distance(expected, np.zeros_like(expected)) > OUTLYING:
+        return f"the first observations of its training are over {OUTLYING:g} standard deviations off"
+    return ""
+
+
+def _normalise(original: Any, statistics: Any) -> Any:
+    """Return observations behind statistics; None where they are of another shape."""
+    try:
+        return statistics.normalize_obs(original)
+    except Exception:  # they are of another environment
+        return None
+
+
+def _distance(one: Any, other: Any) -> float:
+    """Return the median over rows of the largest difference of observations; infinite where their shapes differ."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        return max(_distance(one[key], other[key]) for key in one)
+    if not isinstance(one, np.ndarray) or not isinstance(other, np.ndarray) or one.shape != other.shape or not one.size:
+        return np.inf
+    return float(np.median(np.abs(one.astype(float) - other.astype(float)).reshape(len(one), -1).max(axis=1)))
 
 
 def _is_rescaled(last: Any, original: Any) -> bool:

@@ -149,7 +149,7 @@ def _open_entry(header: Mapping[str, Any], name: str, trust: bool) -> Any:
         return entry
     content = base64.b64decode(str(entry[":serialized:"]))
     try:
-        return pickle.loads(content) if trust else open_pickle(content)
+        return open_pickle(content, trust)
     except ForbiddenObject as error:
         raise ForbiddenObject(f"in its {name!r} {error}") from error
 

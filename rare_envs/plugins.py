@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import difflib
+import dis
 import importlib
 import inspect
 import os
 import re
+import signal
 import sys
 import unicodedata
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
-from types import ModuleType
+from types import ModuleType, TracebackType
 from typing import Any, ClassVar, NoReturn
 
 _ODD, _JOINERS = re.compile(r"[^\n -~]"), "\u200c\u200d"
@@ -32,8 +35,9 @@ def import_module(name: str, purpose: str) -> ModuleType:
     lies_here = own is not None and found is not None and own.origin == found.origin
     sys.path[:0] = [here] * lies_here  # as `python -m` does, and console scripts do not
     try:
-        return importlib.import_module(name)
-    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
+        with as_errors():
+            return importlib.import_module(name)
+    except Exception as error:  # the module is the user's: anything may happen in it
         raise ValueError(f"Cannot import {name!r} for {purpose}: {one_line(error)}.") from error
     finally:
         if lies_here and here in sys.path:
@@ -97,9 +101,45 @@ def clean_text(text: str) -> str:
 
 def one_line(error: BaseException) -> str:
     """Return an exception as a line without colours and full stop: class, up to 200 characters of its message."""
+    error = error.__cause__ if isinstance(error, CodeEnded) and error.__cause__ else error
     words = clean_text(" ".join(_COLOUR.sub("", str(error)).split())).rstrip(".")
     kind = type(error).__name__
     return f"{kind}: {words[:_MAX_WORDS]}" if words else kind
+
+
+class CodeEnded(ValueError):
+    """Somebody's code raised what is meant to end the program; it is the cause."""
+
+
+@contextmanager
+def as_errors() -> Iterator[None]:
+    """Let whatever somebody's code raises in a block be an `Exception`, SystemExit and KeyboardInterrupt included.
+
+    Not `EgoGone`, and not the KeyboardInterrupt of a signal, by which the user ends the run.
+    """
+    try:
+        yield
+    except (Exception, EgoGone):
+        raise
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and _is_of_signal(error):
+            raise
+        raise CodeEnded(repr(error)) from error
+
+
+def _is_of_signal(error: BaseException) -> bool:
+    """Return whether no statement raised an exception, but for one in a signal's handler."""
+    handlers = [getattr(signal.getsignal(number), "__code__", None) for number in signal.valid_signals()]
+    last, *others = [(trace.tb_frame.f_code, trace.tb_lasti) for trace in _walk(error.__traceback__)][::-1]
+    in_handler = any(code in handlers for code, _ in (last, *others))
+    return in_handler or last[0].co_code[last[1]] != dis.opmap["RAISE_VARARGS"]
+
+
+def _walk(trace: TracebackType | None) -> Iterator[TracebackType]:
+    """Yield the parts of a traceback, the innermost last."""
+    while trace is not None:
+        yield trace
+        trace = trace.tb_next
 
 
 class EgoGone(BaseException):

@@ -37,11 +37,11 @@ from rare_envs.egos.needs import (
     resolve,
 )
 from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
-from rare_envs.egos.wrappers import describe_missing_normalisation
+from rare_envs.egos.wrappers import find_normalisation_doubt
 from rare_envs.fast.choice import CORES, CompilerFails, is_compiled, leave_to_torch, simulate
 from rare_envs.make import refuse_unknown, set_up
 from rare_envs.measures.registry import NearCrash
-from rare_envs.plugins import check_name, reason_of
+from rare_envs.plugins import as_errors, check_name, reason_of
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.cuda_graphs import RecordedRollouts
 from rare_envs.simulation.episode import Episode
@@ -165,11 +165,8 @@ class DrivingProblem:
             self._simulate_compiled(np.empty((0, self.dim)))
         said_by_id = bool(layout) and not needs.queries_policy  # nobody named its actions
         doubts = [note for note in self.notes if note != TAKEN_AS_ACCELERATIONS and not said_by_id]
-        missing = describe_missing_normalisation(ego, self.world.observation_space)
-        if missing:
-            advice = "name their file, load_ego(path, stats=FILE), or hand in an ego that normalises before it predicts"
-            doubts.append(f"the ego has no VecNormalize statistics, but {missing}; {advice}")
-        for doubt in doubts:
+        doubts.append(find_normalisation_doubt(ego, self.world.observation_space))
+        for doubt in filter(None, doubts):
             warnings.warn(doubt, EgoWarning, stacklevel=2)
 
     def __repr__(self) -> str:
@@ -210,7 +207,9 @@ class DrivingProblem:
         action = self.world.clock.action
         if not self.needs.queries_policy:
             return () if action == "continuous" else (DRIVES_ITSELF.format(action=action),)
-        return name_ambiguities(self.needs.action_space, self.world.sensing.kinds) if action == "continuous" else ()
+        if action != "continuous":
+            return self.needs.notes
+        return (*self.needs.notes, *name_ambiguities(self.needs.action_space, self.world.sensing.kinds))
 
     @property
     def given(self) -> str:
@@ -422,8 +421,9 @@ class DrivingProblem:
         if not isinstance(self.driver, PolicyDriver):
             return known(world, rows)
         try:
-            end = known(world, rows)
-        except (Exception, SystemExit):  # the policy is the user's: anything may happen in it
+            with as_errors():
+                end = known(world, rows)
+        except Exception:  # the policy is the user's: anything may happen in it
             return None
         # an action that is NaN leaves the ego so for good; f need not notice, since nobody is seen by such an ego
         unknown = torch.stack([end.f.isnan(), *(values[:, 0].isnan() for values in end.state[:4])])

@@ -31,7 +31,7 @@ from agents.remote.protocol import (
     derive_server_keys,
     is_count,
 )
-from rare_envs.plugins import EgoGone, is_policy, reason_of
+from rare_envs.plugins import EgoGone, as_errors, is_policy, reason_of
 from rare_envs.startup import use_one_thread
 
 MAX_CLIENTS, MAX_SESSIONS = 64, 1024
@@ -149,14 +149,15 @@ class RequestHandler:
             demand(given.shape == start.shape, f"start has one number for each of {session.batch} rows")
             start |= given.astype(bool)
         try:
-            action, memory = self._ego.predict(
-                observation, state=session.memory, episode_start=start, deterministic=True
-            )
+            with as_errors():
+                action, memory = self._ego.predict(
+                    observation, state=session.memory, episode_start=start, deterministic=True
+                )
             action = np.asarray(action)
             if action.shape[:1] != (session.batch,):
                 raise ValueError(f"Expected actions for {session.batch} rows, got shape {action.shape}.")
             packed = protocol.pack_array(action)
-        except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
+        except (Exception, EgoGone) as error:  # the ego is the user's: anything may happen in it
             del self._sessions[connection, number]
             raise MalformedMessage(reason_of(error), "ego") from error
         session.memory, session.step, session.size = memory, session.step + 1, _measure_bytes(memory)

@@ -48,6 +48,8 @@ class EgoNeeds:
     """Its part that has noise in x: an object whose `noise_columns` says of a world how many columns; None without."""
     observation_space: Any = None
     """The space of its observations, as it declares it; None if it does not."""
+    notes: tuple[str, ...] = ()
+    """How its files were read, where they can be read in several ways."""
 
     @property
     def observation(self) -> str:
@@ -224,6 +226,7 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
         queries_policy=is_policy(ego) and not lidar,
         varies=getattr(ego, "deterministic", None) is False,
         observation_space=observed,
+        notes=tuple(map(str, ego.notes)) if isinstance(getattr(ego, "notes", None), tuple) else (),
     )
 
 

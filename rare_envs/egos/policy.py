@@ -18,7 +18,7 @@ from rare_envs.devices import move_to
 from rare_envs.egos.dense_policies import DensePolicy, find_inference
 from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, find_rule_based, resolve, takes_indices
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
-from rare_envs.plugins import NoAnswer, reason_of, refuse_ego
+from rare_envs.plugins import NoAnswer, as_errors, reason_of, refuse_ego
 from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.observation import map_kinds, observe
 from rare_envs.simulation.world import Driver, World
@@ -107,7 +107,7 @@ def query_policy(
         return read_actions(kind, action, len(query.start), query.over), hidden
     try:
         actions, hidden, reasons = _query_with_reasons(policy, kind, query)
-    except (Exception, SystemExit) as error:  # the policy is the user's: anything may happen in it
+    except Exception as error:  # the policy is the user's: anything may happen in it
         if query.hidden is not None:
             raise
         hidden, (actions, reasons) = None, _isolate_failing_rows(policy, kind, query, error, len(query.start))
@@ -116,7 +116,7 @@ def query_policy(
 
 
 def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
-    with np.errstate():  # a policy that sets NumPy's errors sets them for itself
+    with np.errstate(), as_errors():  # a policy that sets NumPy's errors sets them for itself
         action, hidden = policy.predict(
             query.observation, state=query.hidden, episode_start=query.start, deterministic=True
         )
@@ -156,7 +156,7 @@ def _isolate_failing_rows(
             if n == 1 and isinstance(error, NoAnswer):
                 raise error  # it is not waited for once more
             found, hidden, why = _query_with_reasons(policy, kind, part)
-        except (Exception, SystemExit) as raised:  # the policy is the user's: anything may happen in it
+        except Exception as raised:  # the policy is the user's: anything may happen in it
             if len(part.start) > 1:
                 found, why = _isolate_failing_rows(policy, kind, part, raised, whole)
             else:

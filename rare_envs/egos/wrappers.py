@@ -136,13 +136,26 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
     return WrappedPolicy(policy, normalise, *stacking, whole, bounds)
 
 
-def describe_missing_normalisation(policy: Any, given: spaces.Space[Any]) -> str:
-    """Return why statistics of a policy's observations of a space seem to be missing; "" if nothing says so."""
-    if hasattr(policy, "find_missing_statistics"):
-        return str(policy.find_missing_statistics(given))
-    if getattr(policy, "get_vec_normalize_env", lambda: policy)() is not None:
-        return ""
-    own = policy.observation_space
-    if isinstance(own, spaces.Box) and isinstance(given, spaces.Box) and np.isfinite(given.high).all():
-        return UNBOUNDED if np.isinf(own.high).all() else ""
-    return ""
+STATS_ADVICE = (
+    "name their file (--stats, load_ego(path, stats=FILE)), or hand in an ego that normalises before it predicts"
+)
+"""What to do about statistics that are missing or of another policy."""
+
+
+def find_inner(ego: Any) -> Any:
+    """Return the ego inside those that stand around another, such as `agents.imperfect_stack.NoisyEgo`."""
+    while hasattr(ego, "in_world") and hasattr(ego, "ego"):
+        ego = ego.ego
+    return ego
+
+
+def find_normalisation_doubt(ego: Any, given: spaces.Space[Any]) -> str:
+    """Return what seems wrong with the statistics of an ego's observations of a space; "" if nothing does."""
+    policy, doubt = find_inner(ego), ""
+    if hasattr(policy, "find_normalisation_doubt"):
+        doubt = str(policy.find_normalisation_doubt(given))
+    elif getattr(policy, "get_vec_normalize_env", lambda: policy)() is None:
+        own, bounded = policy.observation_space, isinstance(given, spaces.Box) and np.isfinite(given.high).all()
+        if bounded and isinstance(own, spaces.Box) and np.isinf(own.high).all():
+            doubt = f"the ego has no VecNormalize statistics, but {UNBOUNDED}"
+    return f"{doubt}; {STATS_ADVICE}" if doubt else ""

@@ -15,7 +15,7 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.layouts import IDM_PARAMETERS, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
-from rare_envs.plugins import check_name, did_you_mean, is_policy, one_line, refuse_ego
+from rare_envs.plugins import as_errors, check_name, did_you_mean, is_policy, one_line, refuse_ego
 from rare_envs.startup import use_one_thread
 
 MAX_SECONDS = 100.0
@@ -182,9 +182,9 @@ class HighwayEnvProblem:
         state = None
         for step in range(round(self._seconds * env.scene.config["policy_frequency"])):
             if policy is not None:
-                actions, state = policy.predict(
-                    np.asarray(observation)[None], state=state, episode_start=np.array([step == 0]), deterministic=True
-                )
+                begun, seen = np.array([step == 0]), np.asarray(observation)[None]
+                with as_errors():
+                    actions, state = policy.predict(seen, state=state, episode_start=begun, deterministic=True)
                 action = np.asarray(actions)[0]
                 if not np.isfinite(action).all():
                     raise ValueError(f"The ego's action is not finite: {action}.")

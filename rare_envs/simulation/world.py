@@ -19,6 +19,7 @@ from rare_envs.distributions.product import NoiseDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import Moment
 from rare_envs.measures.longitudinal import avoid_rapid
+from rare_envs.plugins import as_errors
 from rare_envs.scenarios.base import Others, Scenario, drive_points
 from rare_envs.sensors.camera import WEATHER, CameraContext
 from rare_envs.sensors.lidar import perceive_traffic
@@ -409,9 +410,10 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
 
 def drive_tick(world: World, driver: Driver, episode: Episode, memory: Any) -> tuple[Episode, Any]:
     """Return the episodes one tick later, and the driver's memory."""
-    action, memory = driver.act(episode, memory)
-    episode, action = world.decode_meta_actions(episode, action)
-    return world.step(episode, action), memory
+    with as_errors():  # drivers and measures may be the user's
+        action, memory = driver.act(episode, memory)
+        episode, action = world.decode_meta_actions(episode, action)
+        return world.step(episode, action), memory
 
 
 def rollout(world: World, driver: Driver, x: Tensor) -> Episode:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import samplers
 from agents.saved_ego import SavedEgo
 from rare_envs.distributions.events import EventFrequency
-from rare_envs.egos.wrappers import describe_missing_normalisation
+from rare_envs.egos.wrappers import find_inner, find_normalisation_doubt
 from rare_envs.exposure import MILLION_KM, CollisionRate, TotalRate, explain_no_frequency, normal_quantile, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
@@ -214,21 +214,20 @@ class Report:
     def doubts_of_f(self) -> tuple[str, ...]:
         """Doubts about the ego's statistics, and f as a function; the estimate's own warnings are not among them."""
         again = "" if self.repeatability is None else self.repeatability.warning
-        return tuple(filter(None, (self.missing_statistics, again)))
+        return tuple(filter(None, (self.doubt_of_statistics, again)))
 
     @property
-    def missing_statistics(self) -> str:
-        """Why the ego seems to lack its `VecNormalize` statistics; empty if it does not."""
-        ego, problem = self.study.problem.ego, self.study.problem
-        missing = describe_missing_normalisation(ego, problem.world.observation_space)
-        option = " (--stats)" if isinstance(ego, SavedEgo) else ""
-        return f"the ego has no VecNormalize statistics{option}, but {missing}" if missing else ""
+    def doubt_of_statistics(self) -> str:
+        """What seems wrong with the ego's `VecNormalize` statistics, such as that there are none; empty if nothing."""
+        problem = self.study.problem
+        return find_normalisation_doubt(problem.ego, problem.world.observation_space)
 
     @property
     def vec_normalize(self) -> str | None:
         """File of the `VecNormalize` statistics that were applied to a saved ego's observations, if there was one."""
-        ego = self.study.problem.ego
-        return str(ego.statistics_path) if isinstance(ego, SavedEgo) and ego.statistics_path else None
+        ego = find_inner(self.study.problem.ego)
+        applied = isinstance(ego, SavedEgo) and ego.statistics is not None and ego.statistics.norm_obs
+        return str(ego.statistics_path) if applied else None
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -409,7 +408,7 @@ class Report:
             "doubts": self.warnings,
             "notes": self.notes,
             "vec_normalize": self.vec_normalize,
-            "missing_statistics": self.missing_statistics,
+            "doubt_of_statistics": self.doubt_of_statistics,
             "seconds": self.seconds,
             "earlier_seconds": self.earlier_seconds,
             "n_failures": failures.total,

@@ -18,6 +18,7 @@ from torch import nn
 import rare_envs
 from agents import load_ego
 from agents.onnx import ACTION_TOLERANCE, compare_actions, export_onnx
+from rare_envs.egos.needs import EgoWarning
 from rare_envs.simulation.observation import count_features
 from tests.agents.sb3.test_saved_ego import Still
 
@@ -98,13 +99,17 @@ def test_an_export_that_acts_otherwise_is_not_written(saved: Any, tmp_path: Path
 # --- files from elsewhere ----------------------------------------------------------------------
 
 
-def write(module: nn.Module, path: Path, batch: int = 1, dynamic: bool = True) -> Path:
+def write(
+    module: nn.Module, path: Path, batch: int = 1, dynamic: bool = True, memory: Any = None, outputs: Any = None
+) -> Path:
     """Plain PyTorch's export."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        axes = {"obs": {0: "n"}} if dynamic else None
-        example = torch.zeros(batch, COLUMNS)
-        torch.onnx.export(module, (example,), str(path), input_names=["obs"], dynamic_axes=axes, dynamo=False)
+        examples = [torch.zeros(batch, COLUMNS), *([] if memory is None else [memory])]
+        names, axes = ["obs", "h_in"][: len(examples)], {"obs": {0: "n"}, "h_in": {1: "n"}}
+        options: dict[str, Any] = {"input_names": names, "output_names": outputs, "dynamo": False}
+        given = {name: axes[name] for name in names} if dynamic else None
+        torch.onnx.export(module, tuple(examples), str(path), dynamic_axes=given, **options)
     return path
 
 
@@ -135,9 +140,73 @@ def test_the_best_of_five_scores_is_the_action(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ego.predict(observation)[0], expected)
 
 
-class TwoOutputs(nn.Module):
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return observation[:, :2], observation
+class Outputs(nn.Module):
+    """A policy with all that Stable-Baselines3's `forward` returns, and what ML-Agents has beside."""
+
+    def __init__(self, *order: str) -> None:
+        super().__init__()
+        self.layer, self.order = nn.Linear(COLUMNS, 2), order
+
+    def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        found = {"actions": self.layer(obs), "values": obs.sum(1, keepdim=True), "log_prob": obs.sum(1)}
+        found |= {"version": torch.ones(1), "drawn_actions": found["actions"] + torch.randn(2)}
+        found["deterministic_actions"] = found["actions"]
+        return tuple(found[name] for name in self.order)
+
+
+@pytest.mark.parametrize(
+    ("order", "names", "taken"),
+    [
+        ("actions values log_prob", "", 0),
+        ("version values actions", "", 2),
+        ("values actions", "values actions", 1),
+        ("drawn_actions version deterministic_actions", "drawn_actions version deterministic_actions", 2),
+    ],
+)
+def test_the_actions_are_known_by_their_name_or_their_form(order: str, names: str, taken: int, tmp_path: Path) -> None:
+    network = Outputs(*order.split()).requires_grad_(False)
+    ego = load_ego(write(network, tmp_path / "ego.onnx", outputs=names.split()))
+    observation = np.random.default_rng(0).normal(size=(5, COLUMNS)).astype(np.float32)
+    np.testing.assert_allclose(ego.predict(observation)[0], network.layer(torch.from_numpy(observation)), atol=1e-6)
+    with pytest.warns(EgoWarning, match=r"output '\w+' of ego\.onnx is taken as the actions, not"):
+        notes = rare_envs.DrivingProblem(ENV, ego=ego).notes
+    chosen = names.split()[taken] if names else ego._outputs[0].name
+    assert f"output {chosen!r}" in notes[0]
+
+
+class Fixed(nn.Module):
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return obs[:, :2].reshape(4, 2)
+
+
+class Recurrent(nn.Module):
+    """Its memory has the layers first, as torch's own has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cell = nn.GRU(COLUMNS, 2, num_layers=2, batch_first=True)
+
+    def forward(self, obs: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        actions, h_out = self.cell(obs[:, None], h_in)
+        return obs.sum(1), h_out, actions[:, 0]
+
+
+def test_a_batch_that_only_the_output_fixes_is_kept_to(tmp_path: Path) -> None:
+    ego = load_ego(write(Fixed(), tmp_path / "ego.onnx", batch=4))
+    assert ego.fixed_batch == 4
+    observation = np.random.default_rng(0).normal(size=(10, COLUMNS)).astype(np.float32)
+    np.testing.assert_array_equal(ego.predict(observation)[0], observation[:, :2])
+
+
+def test_a_memory_with_its_layers_first_is_kept_row_by_row(tmp_path: Path) -> None:
+    network = Recurrent().requires_grad_(False)
+    names = ["values", "h_out", "actions"]
+    write(network, tmp_path / "ego.onnx", memory=torch.zeros(2, 1, 2), outputs=names)
+    ego, state, hidden = load_ego(tmp_path / "ego.onnx"), None, torch.zeros(2, 5, 2)
+    for observation in np.random.default_rng(0).normal(size=(3, 5, COLUMNS)).astype(np.float32):
+        action, state = ego.predict(observation, state)
+        _, hidden, expected = network(torch.from_numpy(observation), hidden)
+        np.testing.assert_allclose(action, expected, atol=1e-6)
 
 
 def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
@@ -145,4 +214,6 @@ def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Cannot load .*broken\.onnx' as ONNX"):
         load_ego(tmp_path / "broken.onnx")
     with pytest.raises(ValueError, match=r"one input .* one output"):
-        load_ego(write(TwoOutputs(), tmp_path / "two.onnx"))
+        load_ego(write(Recurrent(), tmp_path / "two.onnx", memory=torch.zeros(2, 1, 2), outputs=["a", "b", "c"]))
+    with pytest.raises(ValueError, match=r"acts in Box.*\(4,\)"):
+        rare_envs.DrivingProblem(ENV, ego=load_ego(write(nn.Linear(COLUMNS, 4), tmp_path / "four.onnx")))

@@ -16,7 +16,7 @@ from typer import Argument, Option
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import as_bad_input
 from rare_envs.study.cli import egos, estimate, runs
-from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, command, ignore_signals
+from rare_envs.study.cli.shell import Answer, OneLineErrors, SummarisedCommands, command, end_soon
 
 EXAMPLES = """
 rare-envs list
@@ -144,10 +144,14 @@ for _name in COMMANDS:
 
 def main() -> None:
     """Run the command line; alone, it shows its help."""
+    code: object = 1
     try:
         app(sys.argv[1:] or ["--help"], prog_name="rare-envs")
+    except SystemExit as end:
+        code = end.code or 0
+        raise
     finally:
-        ignore_signals()
+        end_soon(code if isinstance(code, int) else 1)
 
 
 if __name__ == "__main__":

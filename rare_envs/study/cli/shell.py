@@ -153,10 +153,24 @@ def signals_as_exceptions(received: list[int]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def ignore_signals() -> None:
-    """Ignore signals to end, for a process that has given its answer and is about to end by itself."""
+LINGER = 10.0
+"""Time that threads, processes and exit handlers of an ego have after the answer [s]."""
+
+
+def end_soon(code: int) -> None:
+    """Ignore signals to end, and end the process that has given its answer by itself, whatever an ego left running."""
     for number in _ENDING:
         signal.signal(number, signal.SIG_IGN)
+
+    def end() -> None:
+        _print_stderr(f"rare-envs: done; something that the ego started does not end, and was left after {LINGER:g} s")
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        os._exit(code)
+
+    timer = threading.Timer(LINGER, end)
+    timer.daemon = True
+    timer.start()
 
 
 @contextlib.contextmanager

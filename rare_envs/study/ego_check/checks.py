@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from agents.saved_ego import SavedEgo
+from agents.saved_ego import OUTLYING, SavedEgo
 from rare_envs.devices import CAMERA_TILE
 from rare_envs.distributions.coordinates import AnyArray
 from rare_envs.egos.policy import PolicyDriver
-from rare_envs.egos.wrappers import find_frame_stacking
-from rare_envs.plugins import reason_of
+from rare_envs.egos.wrappers import find_frame_stacking, find_inner
+from rare_envs.plugins import as_errors, reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.observation import batch_size, map_kinds, observe
 from rare_envs.simulation.world import drive
@@ -78,7 +78,8 @@ class Probe:
         """Return the actions as numbers, and the memory."""
         begun = np.full(batch_size(observation), state is None) if start is None else start
         seen = map_kinds(np.copy, observation)
-        action, state = self.policy.predict(seen, state=state, episode_start=begun, deterministic=True)
+        with as_errors():
+            action, state = self.policy.predict(seen, state=state, episode_start=begun, deterministic=True)
         return np.asarray(action), state
 
     def act(self, observation: Any) -> AnyArray:
@@ -124,20 +125,20 @@ def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
         yield Finding("action space", "pass", str(acted))
 
 
-OUTLYING = 5.0
-"""Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
 MANY_OUTLYING = 0.2
 """Share of ordinary scenarios with such observations from which the statistics are most likely of another ego."""
 
 
 def check_normalisation(probe: Probe) -> Iterator[Finding]:
     """Check whether the VecNormalize statistics of a saved ego suit the observations here."""
-    if not isinstance(probe.ego, SavedEgo):
+    ego = find_inner(probe.ego)
+    if not isinstance(ego, SavedEgo):
         return
-    name, statistics, path = "normalisation", probe.ego.statistics, probe.ego.statistics_path
-    missing = probe.ego.find_missing_statistics(probe.problem.world.observation_space)
-    if missing:
-        yield Finding(name, "warn", f"no VecNormalize statistics, but {missing}", "name their file with --stats")
+    name, statistics, path = "normalisation", ego.statistics, ego.statistics_path
+    if doubt := ego.find_normalisation_doubt(probe.problem.world.observation_space):
+        yield Finding(name, "warn", doubt, "name their file with --stats")
+    elif ego.left_out is not None:
+        yield Finding(name, "pass", *ego.notes)
     elif statistics is None:
         advice = "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats"
         yield Finding(name, "pass", "no VecNormalize statistics beside the file", advice)
@@ -196,7 +197,7 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
     for name, case in (cases | {"the upper end": fill("high", 1.0)}).items():
         try:
             bad += [] if np.isfinite(probe.act(case)).all() else [f"{name}: NaN or infinite"]
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             bad.append(f"{name}: {reason_of(error)}")
     advice = "such observations come; rows are zeros after a crash"
     yield judge("range", "; ".join(bad), "finite at zeros and at both ends of what is observed", advice, "fail")

@@ -124,6 +124,8 @@ def run_checks(question: Question) -> Iterator[Finding | str]:
         for note in problem.notes:
             if note in (AMBIGUOUS, TAKEN_AS_ACCELERATIONS):  # of other bounds than ours a check of its own tells
                 yield Finding("action space", "warn", note, "say which by --action", note == AMBIGUOUS)
+            elif note in problem.needs.notes:
+                yield Finding("loading", "warn", note, "see docs/egos.md", False)
         probe = Probe.of(ego, problem)
         if problem.core == "numba":  # then the ego is not asked
             problem.evaluate(problem.base.sample(1, np.random.default_rng(0)))

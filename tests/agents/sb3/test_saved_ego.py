@@ -142,6 +142,18 @@ def test_exploration_by_gsde_has_the_trained_deviations(tmp_path: Path) -> None:
         assert 0 < np.abs(drawn - mean).max() < 0.02
 
 
+@pytest.mark.parametrize("trust", [False, True])
+def test_spaces_of_gym_which_files_of_version_1_hold_are_those_of_gymnasium(trust: bool, tmp_path: Path) -> None:
+    model, old = untrained("dqn"), {}
+    model.save(tmp_path / "new.zip")
+    for name in ("observation_space", "action_space"):
+        content = pickle.dumps(getattr(model, name), protocol=2).replace(b"gymnasium.spaces", b"gym.spaces")
+        assert b"gymnasium" not in content
+        old[name] = {":type:": "gym", ":serialized:": base64.b64encode(content).decode()}
+    ego = load(change_settings(tmp_path / "new.zip", **old), trust=trust)
+    assert (ego.observation_space, ego.action_space) == (model.observation_space, model.action_space)
+
+
 class OwnPolicy(sb3.sac.policies.SACPolicy):
     """A user's subclass, whose module says nothing about the algorithm."""
 

@@ -87,7 +87,7 @@ def test_statistics_under_another_name_are_named(normalised: tuple[Path, Path]) 
     path, statistics = normalised
     ego = load(path, stats=statistics)
     assert ego.statistics_path == statistics
-    assert ego.find_missing_statistics(ego.observation_space) == ""
+    assert ego.find_normalisation_doubt(ego.observation_space) == ""
     with pytest.raises(FileNotFoundError, match="No VecNormalize statistics at"):
         load_ego(path, stats="no/such.pkl")
     with pytest.raises(ValueError, match=r"Expected stats for a Stable-Baselines3 \.zip only"):
@@ -104,8 +104,51 @@ def test_a_file_with_a_replay_buffer_is_doubted_only_behind_vec_normalize(
     sb3.SAC("MlpPolicy", env, seed=0, device="cpu", learning_starts=1000, buffer_size=1000).learn(40).save(
         tmp_path / "ego.zip"
     )
-    found = load(tmp_path / "ego.zip").find_missing_statistics(env.observation_space)
+    found = load(tmp_path / "ego.zip").find_normalisation_doubt(env.observation_space)
     assert ("trained behind VecNormalize" in found) is normalised and bool(found) is normalised
+
+
+@pytest.mark.parametrize("algorithm", [sb3.PPO, sb3.SAC])
+def test_a_file_beside_the_ego_yields_to_what_the_ego_says(algorithm: Any, tmp_path: Path) -> None:
+    """Of a policy trained without `VecNormalize`, statistics of another run that lie beside it, or are named."""
+    own = {"buffer_size": 100, "learning_starts": 50} if algorithm is sb3.SAC else {"n_steps": 8, "batch_size": 8}
+    plain, behind = (DummyVecEnv([lambda: gym.make(ENV)] * 2) for _ in range(2))
+    others = VecNormalize(behind)
+    algorithm("MlpPolicy", others, seed=0, device="cpu", **own).learn(40).save(tmp_path / "other.zip")
+    model = algorithm("MlpPolicy", plain, seed=1, device="cpu", **own).learn(40)
+    model.save(tmp_path / "ego.zip")
+    others.save(str(tmp_path / "vecnormalize.pkl"))
+    assert load(tmp_path / "other.zip").statistics_path == tmp_path / "vecnormalize.pkl"
+    ego = load(tmp_path / "ego.zip")
+    assert (ego.statistics, ego.left_out) == (None, tmp_path / "vecnormalize.pkl")
+    with pytest.warns(EgoWarning, match=r"vecnormalize\.pkl is not applied: .* trained without VecNormalize"):
+        np.testing.assert_array_equal(drive(ego), drive(model))
+    named = load(tmp_path / "ego.zip", stats=tmp_path / "vecnormalize.pkl")
+    with pytest.warns(EgoWarning, match="seem to be those of another ego: .* trained without VecNormalize"):
+        drive(named)
+    (tmp_path / "vecnormalize.pkl").write_bytes(b"of something else")
+    assert load(tmp_path / "ego.zip").left_out is not None
+
+
+def test_statistics_that_do_not_lead_to_what_the_ego_saw_are_doubted(tmp_path: Path) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: gym.make(ENV)]))
+    sb3.SAC("MlpPolicy", env, seed=0, device="cpu", buffer_size=100).learn(40).save(tmp_path / "ego.zip")
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    space = env.observation_space
+    assert load(tmp_path / "ego.zip").find_normalisation_doubt(space) == ""
+    env.obs_rms.mean += 2.0
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    assert "do not lead from the original to" in load(tmp_path / "ego.zip").find_normalisation_doubt(space)
+
+
+def test_statistics_of_rewards_alone_change_nothing(tmp_path: Path) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: gym.make(ENV)]), norm_obs=False)
+    model = sb3.PPO("MlpPolicy", env, **SETTINGS).learn(8)
+    model.save(tmp_path / "ego.zip")
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    ego = load(tmp_path / "ego.zip")
+    for each in (ego, model, pickle.loads(pickle.dumps(ego))):
+        np.testing.assert_array_equal(drive(each), drive(model))
 
 
 def test_the_scale_of_the_last_observations_tells() -> None:

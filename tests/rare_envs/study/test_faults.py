@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,9 +55,19 @@ def gives_nan(actions: Any, short: Any) -> Any:
     return actions
 
 
+def interrupts(actions: Any, short: Any) -> Any:
+    raise KeyboardInterrupt
+
+
+def cancels(actions: Any, short: Any) -> Any:
+    raise asyncio.CancelledError("late")
+
+
 FAILING = {
     "raises": (raises, "RuntimeError: no road"),
     "ends the program": (stops, "SystemExit(7)"),
+    "raises what Ctrl-C does": (interrupts, "KeyboardInterrupt()"),
+    "cancels": (cancels, "CancelledError('late')"),
     "gives NaN": (gives_nan, "NaN or infinite actions"),
     "gives infinity": (lambda actions, short: np.where(short[:, None], np.inf, actions), "NaN or infinite actions"),
     "gives the wrong shape": (lambda actions, short: actions[:, :1], "Expected actions of shape"),
@@ -90,6 +103,15 @@ def test_only_scenarios_on_which_the_ego_fails_are_lost(how: str, memory: bool, 
     np.testing.assert_array_equal([fault.x for fault in tolerant.faults], x[bad])
     assert tolerant.n_retried < (5 if memory else 2) * len(x)
     assert all(reason in fault.reason and "\n" not in fault.reason for fault in tolerant.faults)
+
+
+def test_ctrl_c_while_the_ego_drives_is_no_fault_of_the_ego(x: np.ndarray) -> None:
+    def interrupted(actions: Any, short: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)
+        return actions
+
+    with pytest.raises(KeyboardInterrupt):
+        tolerate(problem(Coasting(interrupted))).evaluate(x)
 
 
 def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:

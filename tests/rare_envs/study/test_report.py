@@ -42,7 +42,7 @@ def test_the_result_names_the_statistics_that_were_applied(cli: Cli, tmp_path: P
     PPO("MlpPolicy", env, n_steps=8, batch_size=32).learn(32).save(tmp_path / "ego.zip")
     words = ("estimate", FOLLOWING, "--ego", str(tmp_path / "ego.zip"), "--method", "mc", "--max-sim", "50", "--json")
     without = json.loads(cli(*words).stdout)
-    assert without["vec_normalize"] is None and "trained behind VecNormalize" in without["missing_statistics"]
+    assert without["vec_normalize"] is None and "trained behind VecNormalize" in without["doubt_of_statistics"]
     assert "warning: the ego has no VecNormalize statistics" in cli(*words[:-1]).stdout
     env.save(str(tmp_path / "vecnormalize.pkl"))
     assert json.loads(cli(*words).stdout)["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")

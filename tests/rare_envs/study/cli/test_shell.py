@@ -125,3 +125,20 @@ def test_a_signal_after_the_answer_changes_nothing_and_nothing_heavy_is_imported
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("rare-envs ")
+
+
+@pytest.mark.parametrize(
+    "left", ["threading.Thread(target=time.sleep, args=(99,)).start()", "atexit.register(time.sleep, 99)"]
+)
+def test_what_an_ego_leaves_behind_does_not_keep_the_command_from_its_end(left: str) -> None:
+    program = (
+        "import atexit, sys, threading, time\n"
+        "from rare_envs.study.cli import app, shell\n"
+        f"{left}\n"
+        "shell.LINGER = 0.1\n"
+        "sys.argv = ['rare-envs', '--version']\n"
+        "app.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0 and done.stdout.startswith("rare-envs ")
+    assert "something that the ego started does not end" in done.stderr
