@@ -147,7 +147,7 @@ def test_spaces_of_gym_which_files_of_version_1_hold_are_those_of_gymnasium(trus
     model, old = untrained("dqn"), {}
     model.save(tmp_path / "new.zip")
     for name in ("observation_space", "action_space"):
-        content = pickle.dumps(getattr(model, name), protocol=2).replace(b"gymnasium.spaces", b"gym.spaces")
+        content = pickle.dumps(getattr(model, name), protocol=3).replace(b"gymnasium.spaces", b"gym.spaces")
         assert b"gymnasium" not in content
         old[name] = {":type:": "gym", ":serialized:": base64.b64encode(content).decode()}
     ego = load(change_settings(tmp_path / "new.zip", **old), trust=trust)
