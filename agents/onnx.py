@@ -159,15 +159,15 @@ class OnnxEgo:
         """Find the batch size that the file fixes, if any, and return actions; refuse a file that answers to none."""
         declared = [size for port in self._outputs for size in port.shape[:1] if isinstance(size, int)]
         fixed = [batch] if isinstance(batch, int) else [None, *declared, 1]
-        first: Exception | None = None
+        found = list[Exception]()
         for self.fixed_batch in fixed:
             try:
                 for size in _TRIED_SIZES:
                     action, *_ = self._run(self._blank(size))
                 return action
             except Exception as error:  # likewise
-                first = first or error
-        raise ValueError(f"Cannot run {str(self.path)!r} on a batch of blank observations: {one_line(first)}.")
+                found.append(error)
+        raise ValueError(f"Cannot run {str(self.path)!r} on a batch of blank observations: {one_line(found[0])}.")
 
     def _run(self, values: list[NDArray[Any]]) -> list[NDArray[Any]]:
         """Return the outputs for all rows, in portions if the file fixes the batch size; the last row fills up."""

@@ -138,7 +138,7 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
     if doubt := ego.find_normalisation_doubt(probe.problem.world.observation_space):
         yield Finding(name, "warn", doubt, "name their file with --stats")
     elif ego.left_out is not None:
-        yield Finding(name, "pass", *ego.notes)
+        yield Finding(name, "pass", "; ".join(ego.notes))
     elif statistics is None:
         advice = "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats"
         yield Finding(name, "pass", "no VecNormalize statistics beside the file", advice)
