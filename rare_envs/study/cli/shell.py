@@ -163,7 +163,7 @@ def end_soon(code: int) -> None:
         signal.signal(number, signal.SIG_IGN)
 
     def end() -> None:
-        _print_stderr(f"rare-envs: done; something that the ego started does not end, and was left after {LINGER:g} s")
+        print_stderr(f"rare-envs: done; something that the ego started does not end, and was left after {LINGER:g} s")
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
         os._exit(code)
