@@ -210,7 +210,7 @@ class Estimate(EstimateData, Kept):
             >>> shares = result.shares(lambda x: np.where(x[:, 0] > 0, "right", "left").tolist())
             >>> for side in ("left", "right"):
             ...     print(f"{side} {shares[side].p:.5f}, {shares[side].of_failures:.0%} of p")
-            left 0.00135, 50% of p
+            left 0.00132, 50% of p
             right 0.00135, 50% of p
         """
         return split_by_kind(self, label, most)

@@ -256,6 +256,6 @@ def describe_discovery(p: float, high: float, raised: float, discovery: Discover
         return []
     size = f"with probability up to {p * share / (1 - share):.1e} ({share:.0%} of p)"
     return [
-        f"{discovery.searches:.0f} independent searches reached failure, in {discovery.regions} regions: further "
+        f"Searches that reached failure: {discovery.searches:.0f}, failure regions found: {discovery.regions}; further "
         f"failure regions {size} cannot be excluded, and the interval includes them."
     ]
