@@ -153,7 +153,8 @@ class DrivingProblem:
             self.needs = needs = resolve(ego, scenario.vehicles)
         kinds = settings.get("observation") or choose_observation(needs, scenario.vehicles)
         settings["observation"] = kinds
-        settings["action"] = settings.get("action") or choose_action(needs.action_space, read_kinds(kinds))
+        acted = needs.action_space if needs.queries_policy else None
+        settings["action"] = settings.get("action") or choose_action(acted, read_kinds(kinds))
         self.world, self.space = set_up(scenario, needs, measure=measure, base=base, noise=noise, **settings)
         self.dim, self.column_names, self.base = self.space.dim, self.space.column_names, self.space.base
         with _ego_errors_as_value_errors(ego):

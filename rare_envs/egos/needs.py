@@ -125,7 +125,8 @@ def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
         return ("camera",)
     found = {kind: find_frame_stacking(observation_space(vehicles, kind), observed) for kind in OBSERVATIONS}
     single = tuple(kind for kind, frames in found.items() if frames == (1, False))
-    return single or tuple(kind for kind, frames in found.items() if frames is not None and kind != "speed")
+    unlike = ("speed", "kinematics")  # whose multiples are other observations: of one number, or features of HighwayEnv
+    return single or tuple(kind for kind, frames in found.items() if frames is not None and kind not in unlike)
 
 
 def _shows_pictures(observed: Any) -> bool:
@@ -153,8 +154,17 @@ def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
 
 
 def choose_action(action_space: Any, observation: str) -> str:
-    """Return the kind of actions where nobody names it; with HighwayEnv's kinematics 0 to 4 fit two kinds."""
-    if takes_indices(action_space) and "kinematics" in observation.split("+"):
+    """Return the kind of actions where nobody names it; with HighwayEnv's kinematics its policies' fit two kinds."""
+    if "kinematics" not in observation.split("+"):
+        return "continuous"
+    if isinstance(action_space, spaces.Box) and action_space.shape == (2,):
+        raise ValueError(
+            "The ego's two actions fit two kinds: acceleration and steering up to 5 m/s^2 and 0.1 rad each tick "
+            "(action='continuous', --action continuous), and HighwayEnv's ContinuousAction, pi/4 rad for a second, "
+            "which drives in HighwayEnv's environments alone (rare_envs.highway_env_problem, rare-envs estimate "
+            "highway-fast-v0); say which."
+        )
+    if takes_indices(action_space):
         raise ValueError(
             "The ego's actions 0 to 4 fit two kinds: HighwayEnv's meta-actions (action='meta', --action meta; or the "
             "environment's id with -kinematics) and five accelerations (action='discrete', --action discrete); say "

@@ -14,7 +14,7 @@ from pettingzoo import ParallelEnv
 from torch import Tensor
 
 from rare_envs.control.actions import read_actions
-from rare_envs.egos.needs import EgoNeeds, load_named_ego, resolve
+from rare_envs.egos.needs import EgoNeeds, choose_action, load_named_ego, resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.rendering import RENDER_MODES, Renderer
 from rare_envs.envs.rows_and_infos import (
@@ -30,7 +30,7 @@ from rare_envs.make import set_up
 from rare_envs.multi_agent import MultiAgentEpisode, Reward, command_nobody, own_reward, start, step_agents, total_of
 from rare_envs.plugins import check_name
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.observation import map_kinds, observe
+from rare_envs.simulation.observation import map_kinds, observe, read_kinds
 
 Actions = Mapping[str, Any]
 FloatArray = NDArray[np.float32]
@@ -45,7 +45,9 @@ class _SeveralAgents:
         """Take the arguments of an environment, and return the names of its agents."""
         ego = load_named_ego(ego)
         needs = resolve(ego)
-        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **settings)
+        acted, seen = needs.action_space if needs.queries_policy else None, settings.get("observation", "features")
+        kind = settings.get("action") or choose_action(acted, read_kinds(seen))
+        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **{**settings, "action": kind})
         self.world = world.with_statistics()
         vehicles = self.world.scenario.vehicle_names
         names = _select_agents(vehicles, agents)
@@ -123,21 +125,20 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
         self.render_mode = render_mode
         self._renderer = Renderer(self.world, render_mode)
         self.agents: list[str] = []
-        self._spaces = {
-            agent: (self.world.observation_space, self.world.action_space) for agent in self.possible_agents
-        }
-        self._np_random: np.random.Generator | None = None
+        self.observation_spaces = {agent: self.world.observation_space for agent in self.possible_agents}
+        self.action_spaces = {agent: self.world.action_space for agent in self.possible_agents}
+        self.np_random, _ = seeding.np_random()
         self._x = np.full(self.space.dim, np.nan)
         self._memory: Any = None
         self._tick = 0
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the space of an agent's observations."""
-        return self._spaces[agent][0]
+        return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Return the space of an agent's actions."""
-        return self._spaces[agent][1]
+        return self.action_spaces[agent]
 
     @property
     def state_space(self) -> "spaces.Box[np.float32]":
@@ -159,11 +160,11 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
         Returns:
             Observations and infos by agent.
         """
-        if seed is not None or self._np_random is None:
-            self._np_random, _ = seeding.np_random(seed)
+        if seed is not None:
+            self.np_random, _ = seeding.np_random(seed)
         if options == {"options": 1}:
             options = None  # what PettingZoo's conformance test asks for, to see that options are taken at all
-        self._x = self.space.scenario_x(options, 1, self._np_random)[0]
+        self._x = self.space.scenario_x(options, 1, self.np_random)[0]
         self._tick, self._memory, self.agents = 0, None, list(self.possible_agents)
         self._episode = episode = self._start(self._x[None])
         views = self._views(episode)
@@ -179,19 +180,22 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
         Args:
             actions: Actions by agent, as in `DrivingEnv.step`; an agent without one, or with None, leaves its vehicle
-                to its driver.
+                to its driver; those of agents that have left do not count.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos of the agents that were there before the step.
+            Observations, rewards, terminations, truncations and infos of the agents that were there before the step;
+            empty mappings when all have left, as PettingZoo's own environments.
 
         Raises:
-            ValueError: If an agent does not exist or has left, or an action has the wrong shape or is NaN.
-            RuntimeError: If all agents have left, or there was no `reset`.
+            ValueError: If an agent does not exist, or an action has the wrong shape or is NaN.
+            RuntimeError: If there was no `reset`.
         """
-        if self._episode is None or not self.agents:
+        if self._episode is None:
             raise RuntimeError("Expected reset() before step(): no agent is there.")
         if not isinstance(actions, Mapping):
             raise ValueError(f"Expected actions as a mapping of agents to actions, got {type(actions).__name__}.")
+        if not self.agents:
+            return {}, {}, {}, {}, {}
         rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
         with torch.inference_mode():
             chosen, commanded = self._read(actions)
@@ -219,11 +223,9 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
         """Return actions of all vehicles, (1, N, 2) or (1, N), and which are commanded, (1, N)."""
         chosen, commanded = command_nobody(self.world, 1)
         for agent, action in actions.items():
-            if action is None:
-                continue
             check_name("agent", agent, self.possible_agents)
-            if agent not in self.agents:
-                raise ValueError(f"Expected actions of {', '.join(self.agents)} only: {agent!r} has left.")
+            if action is None or agent not in self.agents:
+                continue
             shape = self.world.action_space.shape
             if np.shape(action) != shape:
                 raise ValueError(f"Expected an action of shape {shape} for {agent!r}, got {np.shape(action)}.")
@@ -301,10 +303,10 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
         self._x = np.full((self.scenarios, self.space.dim), np.nan)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start all scenarios, by one generator (of a list of seeds, the first): observations (B A, F), and infos."""
-        super().reset(seed=seed[0] if isinstance(seed, list) else seed)
+        """Start all scenarios, by one generator: observations (B A, F), and infos."""
+        super().reset(seed=seed)
         self._x = self.space.scenario_x(options, self.scenarios, self.np_random)
         self._tick[:] = 0
         self._episode = self._start(self._x)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -78,6 +80,25 @@ class DrawsAhead:
                 self._rng.bit_generator.state = self._before
                 self._base.sample(self._given, self._rng)
             self._rng, self._rows = None, self._rows[:0]
+
+
+class StatesLength:
+    """`spec` of an environment that says the length of an episode, `max_episode_steps`, as its world has it."""
+
+    world: World
+    _last_tick: int
+    """Tick at which an episode is truncated."""
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How `gym.make` or `gym.make_vec` has made it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        steps = self._last_tick // self.world.clock.stride
+        self._spec = value and replace(value, max_episode_steps=value.max_episode_steps or steps)
 
 
 def take_step(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.envs.rendering import RENDER_MODES, Renderer, make_scene
-from rare_envs.envs.rows_and_infos import SingleObservation, episode_info, step_info, take_step
+from rare_envs.envs.rows_and_infos import SingleObservation, StatesLength, episode_info, step_info, take_step
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import CONFIGURATION_ARGUMENTS, set_up
 from rare_envs.plugins import check_name
@@ -56,7 +56,7 @@ class FixedConfiguration(UserDict[str, Any]):
         warnings.warn(message, stacklevel=2)
 
 
-class DrivingEnv(gym.Env[SingleObservation, Any]):
+class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
     """Environment of the ego; everything else follows the scenario.
 
     Observation: `features`, see `rare_envs.simulation.observation`. Action: acceleration and steering in [-1, 1], see
@@ -89,7 +89,7 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         self._renderer = Renderer(self.world, render_mode)
         self._x = np.full(self.space.dim, np.nan)
         self._episode: Episode | None = None
-        self._tick = 0
+        self._tick, self._last_tick = 0, self.world.clock.ticks
         self._compiled = find_scripted_step(self.world, core)
         self._between = False
         self._recorder: Any = None
@@ -141,7 +141,7 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)
-        truncated = not terminated and self._tick >= self.world.clock.ticks
+        truncated = not terminated and self._tick >= self._last_tick
         info = step_info(self.space, self._x, episode, terms, terminated or truncated)
         if self._renderer.is_window:
             self.render()

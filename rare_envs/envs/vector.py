@@ -1,12 +1,15 @@
 """Environment of many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
 
 import json
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -18,6 +21,7 @@ from rare_envs.envs.rendering import Renderer
 from rare_envs.envs.rows_and_infos import (
     DrawsAhead,
     Info,
+    StatesLength,
     list_tensors,
     mask_infos,
     merge_rows,
@@ -34,13 +38,13 @@ from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from rare_envs.traffic.state import map_tensors
 
 
-class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
+class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """`DrivingEnv` for a whole batch, with Gymnasium's autoreset modes, SAME_STEP unless another one is asked for.
 
     With SAME_STEP an episode that ends is replaced within the step by one drawn from the base distribution; its last
     observation and info are in `infos["final_obs"]` and `infos["final_info"]`. With NEXT_STEP the next step replaces
     it, whose action does not count and whose reward is 0. With DISABLED a `reset` with options={"reset_mask": rows}
-    does. One generator draws for the whole batch.
+    does. One generator draws for the whole batch, but for episodes that were given seeds of their own.
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)
@@ -55,6 +59,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         num_envs: int = 1,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
         core: str = "auto",
         device: str = "cpu",
         **kwargs: Any,
@@ -66,14 +71,17 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             num_envs: Number of scenarios.
             render_mode: None or "rgb_array" (one image for each scenario).
             autoreset_mode: Gymnasium's, or its value: "SameStep", "NextStep" or "Disabled".
+            max_episode_steps: Number of steps after which an episode is truncated before the horizon.
             core: What carries out the steps, "torch" or "numba" (compiled, for scripted scenarios); "auto" for the
                 compiled ones where they can be had. They differ by rounding.
             device: Where torch carries them out: "cpu", or a GPU, such as "cuda". Observations and rewards are arrays
                 as ever.
             **kwargs: See `rare_envs.make.set_up`.
         """
-        if not isinstance(num_envs, (int, np.integer)) or isinstance(num_envs, bool) or num_envs < 1:
-            raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
+        steps = sys.maxsize if max_episode_steps is None else max_episode_steps
+        for name, count in (("num_envs", num_envs), ("max_episode_steps", steps)):
+            if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
+                raise ValueError(f"Expected {name} of at least 1, got {count!r}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
         if not isinstance(autoreset_mode, AutoresetMode):
@@ -88,6 +96,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self.world = world.with_statistics()
         fps = self.world.clock.decisions_per_second
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self._mode}
+        self._last_tick = min(self.world.clock.ticks, steps * self.world.clock.stride)
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
         self.single_observation_space = self.world.observation_space
@@ -98,6 +107,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
         """Episodes that are over and were not replaced yet."""
+        self._own: dict[int, np.random.Generator] = {}
+        """Generators of episodes that were given seeds of their own."""
         self._episode: Episode | None = None
         self._renderer = Renderer(self.world, render_mode)
         self._compiled = find_scripted_step(self.world, core) if self.device.type == "cpu" else None
@@ -122,12 +133,13 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._np_random, self._np_random_seed = value, -1
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], Info]:
         """Start all episodes.
 
         Args:
-            seed: Seeds the one generator of the batch; a list is taken as one seed.
+            seed: Seeds the one generator of the batch. Of a list each episode, and those that replace it, has a seed of
+                its own and is that of `gym.make(...).reset(seed=...)`; None leaves it the generator that it has.
             options: Scenario parameters by name, scalars or arrays of shape (num_envs,), or {"x": (d,) or
                 (num_envs, d)}; what is not given is drawn as in `DrivingEnv.reset`. "reset_mask", boolean of shape
                 (num_envs,), names the R episodes to start, with arrays of as many values; the others go on.
@@ -135,13 +147,17 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         Returns:
             Observations, shape (num_envs, F), and infos.
         """
-        if isinstance(seed, list):
-            self._np_random = np.random.default_rng([s for s in seed if s is not None] or None)
-        else:
-            super().reset(seed=seed)
         mask, options = self._read_mask(options)
+        if isinstance(seed, Sequence):
+            if len(seed) != self.num_envs:
+                raise ValueError(f"Expected one seed for each of {self.num_envs} environments, got {len(seed)}.")
+            given = {row: seed[row] for row in np.flatnonzero(mask).tolist() if seed[row] is not None}
+            self._own |= {row: seeding.np_random(each)[0] for row, each in given.items()}
+        elif seed is not None:
+            self._own.clear()
+            super().reset(seed=seed)
         if mask.all():
-            self._x = self.space.scenario_x(options, self.num_envs, self.np_random)
+            self._x = self._draw(np.arange(self.num_envs), options)
             self._tick[:] = 0
             with torch.inference_mode():
                 self._episode = self._start(self._x)
@@ -193,7 +209,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._episode = episode
         self._tick += np.where(fresh, 0, self.world.clock.stride)
         terminated = episode.collided.numpy(force=True) & ~fresh
-        truncated = (self._tick >= self.world.clock.ticks) & ~terminated & ~fresh
+        truncated = (self._tick >= self._last_tick) & ~terminated & ~fresh
         known = features is not None and self.world.sensing.observation == "features"
         observation = features if known else self._observe(episode)
         observation, infos = self._finish(observation, terms, terminated | truncated, fresh)
@@ -233,8 +249,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
     def _replace(self, rows: NDArray[np.intp], options: dict[str, Any] | None = None) -> Episode:
         """Start the episodes of some rows anew, and return them, a batch of R."""
         assert self._episode is not None
-        rng = self.np_random if self._np_random is None else self._np_random  # without the property, which settles
-        x = self.space.scenario_x(options, len(rows), rng, self._ahead.sample)
+        x = self._draw(rows, options)
         self._x = self._x.copy()
         self._x[rows] = x
         self._tick[rows] = 0
@@ -242,6 +257,17 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             started = self._start(x)
             self._episode = merge_rows(self._episode, self._place(rows), started)
         return started
+
+    def _draw(self, rows: NDArray[np.intp], options: dict[str, Any] | None) -> NDArray[np.float64]:
+        """Return scenarios (R, d) of some rows, of which those with a generator of their own draw from that."""
+        rng = self.np_random if self._np_random is None else self._np_random  # without the property, which settles
+        own = [self._own.get(row) for row in rows.tolist()]
+
+        def draw(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+            common = iter(self._ahead.sample(own.count(None), rng) if None in own else ())
+            return np.stack([next(common) if each is None else self.space.base.sample(1, each)[0] for each in own])
+
+        return self.space.scenario_x(options, len(rows), rng, draw if self._own else self._ahead.sample)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None
@@ -268,7 +294,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         return measure | mask_infos({"collision_type": kinds, "crash": crash | {"kind": kinds}}, crashed)
 
     def export_state(self) -> dict[str, Any]:
-        """Return the episodes under way and the generator, to go on with them in another process: `restore_state`.
+        """Return the episodes under way and the generators, to go on with them in another process: `restore_state`.
 
         Returns:
             Tensors and text only.
@@ -283,7 +309,9 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             "tick": torch.from_numpy(self._tick.copy()),
             "ended": torch.from_numpy(self._ended.copy()),
             "episode": [tensor.clone().cpu() for tensor in list_tensors(self._episode)],
-            "generator": json.dumps(self.np_random.bit_generator.state),
+            "generators": json.dumps(
+                [(k, g.bit_generator.state) for k, g in {-1: self.np_random, **self._own}.items()]
+            ),
         }
 
     def restore_state(self, state: dict[str, Any]) -> None:
@@ -298,7 +326,10 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._episode = map_tensors(lambda _: new.pop(0).to(self.device), self._episode)
         self._x, self._tick = state["x"].numpy().copy(), state["tick"].numpy().copy()
         self._ended = state["ended"].numpy().copy()
-        self.np_random.bit_generator.state = json.loads(state["generator"])
+        self._own.clear()
+        for row, kept in json.loads(state["generators"]):
+            rng = self.np_random if row < 0 else self._own.setdefault(row, np.random.default_rng())
+            rng.bit_generator.state = kept
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image for each scenario."""

@@ -3,14 +3,16 @@
 Where HighwayEnv draws, the distributions are those from which it draws; docs/highway_env.md has the tables.
 """
 
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from highway_env.envs.highway_env import HighwayEnv
+from highway_env.envs.highway_env import HighwayEnv, HighwayEnvFast
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.envs.merge_env import MergeEnv
 from highway_env.envs.roundabout_env import RoundaboutEnv
@@ -49,8 +51,8 @@ class Layout(NamedTuple):
     """Puts values into the scene that the environment has just made."""
     vehicles: tuple[int, int | None]
     """Default number of vehicles with parameters, and the largest; None for as many as there are."""
-    idm: tuple[float, float, float, float] = (1.5, 5.0, 3.0, 5.0)
-    """HighwayEnv's values of `IDM_PARAMETERS`, in its order."""
+    idm: Mapping[str, float] = MappingProxyType({})
+    """Values of `IDM_PARAMETERS` that the environment sets, whatever the class of its vehicles."""
     leftover: bool = True
     """Whether anything is left that HighwayEnv draws."""
     prepare: Callable[[Any], None] = lambda env: None
@@ -91,6 +93,8 @@ class IDMSetting(NamedTuple):
     """A parameter of IDM that is an attribute of HighwayEnv's vehicles, as sign * value + shift."""
 
     attribute: str
+    usual: float
+    """Of `IDMVehicle`; a class of the user's may have another one."""
     within: Range
     spread: float
     meaning: str
@@ -99,22 +103,34 @@ class IDMSetting(NamedTuple):
 
 
 IDM_PARAMETERS = {
-    "time_headway": IDMSetting("TIME_WANTED", ("s", 0.1, 5.0), 1.0, "time gap that the others want"),
+    "time_headway": IDMSetting("TIME_WANTED", 1.5, ("s", 0.1, 5.0), 1.0, "time gap that the others want"),
     "jam_distance": IDMSetting(
-        "DISTANCE_WANTED", ("m", 0.0, 20.0), 2.0, "bumper gap that they want at standstill", shift=HIGHWAY_ENV_LENGTH
+        "DISTANCE_WANTED", 5.0, ("m", 0.0, 20.0), 2.0, "bumper gap that they want at rest", shift=HIGHWAY_ENV_LENGTH
     ),
-    "max_acceleration": IDMSetting("COMFORT_ACC_MAX", ("m/s^2", 0.5, 10.0), 1.5, "their largest acceleration"),
-    "comfortable_deceleration": IDMSetting("COMFORT_ACC_MIN", ("m/s^2", 0.5, 10.0), 1.5, "their comfortable one", -1.0),
+    "max_acceleration": IDMSetting("COMFORT_ACC_MAX", 3.0, ("m/s^2", 0.5, 10.0), 1.5, "their largest acceleration"),
+    "comfortable_deceleration": IDMSetting(
+        "COMFORT_ACC_MIN", 5.0, ("m/s^2", 0.5, 10.0), 1.5, "their comfortable one", -1.0
+    ),
 }
 """Parameters of the Intelligent Driver Model that all vehicles but the ego share; each has a Beta(2, 2) distribution
 around HighwayEnv's value."""
 
 
-def idm_groups(layout: Layout) -> list[Group]:
-    """Return one group for each parameter of IDM."""
+def idm_groups(layout: Layout, kind: type) -> list[Group]:
+    """Return one group for each parameter of IDM, around its value in HighwayEnv; none for vehicles without IDM.
+
+    Those of `IDMVehicle` itself are known: HighwayEnv's intersection changes them for good.
+    """
+    if not issubclass(kind, IDMVehicle):
+        return []
+    own = ChainMap(*(dict(vars(each)) for each in kind.__mro__[: kind.__mro__.index(IDMVehicle)]))
     groups = []
-    for usual, (name, it) in zip(layout.idm, IDM_PARAMETERS.items(), strict=True):
+    for name, it in IDM_PARAMETERS.items():
+        usual = it.sign * (own[it.attribute] - it.shift) if it.attribute in own else it.usual
+        usual = layout.idm.get(name, usual)
         _, least, most = it.within
+        if not least < usual < most:
+            raise ValueError(f"Expected {name} of {kind.__name__} between {least} and {most}, got {usual}.")
         spread = min(it.spread, usual - least, most - usual)
         groups.append(uniform(name, it.within, usual - spread, usual + spread, it.meaning, usual, shape=2))
     return groups
@@ -124,20 +140,23 @@ def set_idm(vehicles: list[Any], values: Values) -> None:
     """Set the parameters of IDM on the vehicles themselves: HighwayEnv's intersection changes their class."""
     for vehicle in vehicles:
         if isinstance(vehicle, IDMVehicle):
-            for name, it in IDM_PARAMETERS.items():
+            for name in IDM_PARAMETERS.keys() & values.keys():
+                it = IDM_PARAMETERS[name]
                 setattr(vehicle, it.attribute, it.sign * float(values[name]) + it.shift)
 
 
 @contextmanager
 def restore_class_parameters(kind: type) -> Iterator[None]:
     """Put the parameters of IDM of a class back afterwards: HighwayEnv's intersection changes them for good."""
-    names = [it.attribute for it in IDM_PARAMETERS.values() if hasattr(kind, it.attribute)]  # not each class has all
-    before = {name: getattr(kind, name) for name in names}
+    before = {it.attribute: vars(kind).get(it.attribute) for it in IDM_PARAMETERS.values()}
     try:
         yield
     finally:
         for name, value in before.items():
-            setattr(kind, name, value)
+            if value is not None:
+                setattr(kind, name, value)
+            elif name in vars(kind):
+                delattr(kind, name)
 
 
 def move(vehicle: Any, lane_index: tuple[str, str, int], place: float, speed: float) -> None:
@@ -321,6 +340,7 @@ def _without_challenger(env: Any) -> None:
     def spawn_without_challenger(*args: Any, **kwargs: Any) -> Any:
         return None if kwargs.get("go_straight") else spawn(*args, **kwargs)
 
+    vars(spawn_without_challenger)["__func__"] = IntersectionEnv._spawn_vehicle  # to a second wrapper it is that
     env._spawn_vehicle = spawn_without_challenger
 
 
@@ -371,12 +391,24 @@ def _arrange_roundabout(env: Any, values: Values) -> None:
         move(vehicle, lane_index, place, speed)
 
 
+_HIGHWAY = Layout(_highway_groups, _arrange_highway, (4, None))
 LAYOUTS: dict[type, Layout] = {
-    HighwayEnv: Layout(_highway_groups, _arrange_highway, (4, None)),
+    HighwayEnvFast: _HIGHWAY,
+    HighwayEnv: _HIGHWAY,
     MergeEnv: Layout(_merge_groups, _arrange_merge, (4, 4), leftover=False),
     IntersectionEnv: Layout(
-        _intersection_groups, _arrange_intersection, (1, 1), (1.5, 2.0, 6.0, 3.0), prepare=_without_challenger
+        _intersection_groups,
+        _arrange_intersection,
+        (1, 1),
+        {"jam_distance": 2.0, "max_acceleration": 6.0, "comfortable_deceleration": 3.0},
+        prepare=_without_challenger,
     ),
     RoundaboutEnv: Layout(_roundabout_groups, _arrange_roundabout, (4, 4)),
 }
-"""Class of the environment to its layout."""
+"""Class of the environment to its layout, a subclass before its parent."""
+SCENE_METHODS = (
+    "reset _reset _create_road _create_vehicles _make_road _make_vehicles _spawn_vehicle _clear_vehicles".split()
+)
+"""Methods of HighwayEnv's environments that make a scene; all others are called as the environment has them."""
+STARTING_METHODS = ("__init__", "create_random", "make_on_lane", "create_from", "randomize_behavior")
+"""Methods of HighwayEnv's vehicles that start one."""

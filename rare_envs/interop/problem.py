@@ -12,8 +12,9 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.egos.wrappers import wrap_policy
-from rare_envs.interop.layouts import IDM_PARAMETERS, restore_class_parameters, set_idm
+from rare_envs.egos.needs import EgoWarning, name_ambiguities
+from rare_envs.egos.wrappers import WrappedPolicy, wrap_policy
+from rare_envs.interop.layouts import idm_groups, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
 from rare_envs.plugins import as_errors, check_name, did_you_mean, is_policy, one_line, refuse_ego
 from rare_envs.startup import use_one_thread
@@ -30,7 +31,10 @@ def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[A
     with restore_class_parameters(IDMVehicle), warnings.catch_warnings():
         # an older version is asked for on purpose: results belong to a version
         warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
-        env = gym.make(env_id, config=None if config is None else dict(config))
+        try:
+            env = gym.make(env_id, config=None if config is None else dict(config))
+        except Exception as error:  # HighwayEnv reads its configuration without a check
+            raise ValueError(f"HighwayEnv makes no {env_id} of the config {config}: {one_line(error)}.") from error
     for word in config or ():
         check_name(f"key of the config of {env_id}", word, env.unwrapped.default_config())  # type: ignore[attr-defined]
     return env
@@ -67,8 +71,8 @@ def make_policy(ego: Any, env: gym.Env[Any, Any]) -> Any:
         fits = type(expected) is type(given) and getattr(expected, "shape", None) == getattr(given, "shape", None)
         if expected is not None and not (fits and getattr(expected, "n", None) == getattr(given, "n", None)):
             raise ValueError(
-                f"The ego was made for {what}s {expected}, the environment has {given}; "
-                f"give the environment the config that the ego was trained with."
+                f"The ego was made for {what}s {expected}, the environment has {given}; give the environment the "
+                "config that the ego was trained with: highway_env_problem(..., config={...}), or --env-config FILE."
             )
     return wrap_policy(policy, env.observation_space)
 
@@ -78,7 +82,7 @@ def replace_ego_by_idm(env: HighwayEnvScenario) -> None:
     inner = env.scene
     old = inner.vehicle
     driver = IDMVehicle.create_from(old)
-    set_idm([driver], dict(zip(IDM_PARAMETERS, env.layout.idm, strict=True)))
+    set_idm([driver], {group.parameters[0].name: group.usual for group in idm_groups(env.layout, IDMVehicle)})
     inner.road.vehicles[inner.road.vehicles.index(old)] = driver
     inner.controlled_vehicles = [driver]
     inner.define_spaces()
@@ -93,6 +97,7 @@ class HighwayEnvProblem:
     Attributes:
         env_id: The environment's id.
         ego: What was given; in another process its policy alone.
+        config: HighwayEnv's configuration as it was given.
         space: Names, units, bounds and base distribution of x.
         dim: Number of columns of x.
         column_names: Their names, for the tables of results.
@@ -145,11 +150,18 @@ class HighwayEnvProblem:
         is_idm = isinstance(ego, str) and ego == "idm"
         if not is_idm and not is_policy(ego) and (isinstance(ego, type) or not callable(ego)):
             refuse_ego(ego)
-        self.env_id, self.ego, self._config, self._seconds = env_id, ego, config, float(horizon)
+        self.env_id, self.ego, self.config = env_id, ego, config
         self._settings = settings
         is_model = is_policy(ego) and hasattr(ego, "get_vec_normalize_env")  # anybody's object need not have it
         self._policy = None if is_idm else BarePolicy(ego) if is_model else ego
-        env, _ = self._driven
+        env, policy = self._driven
+        if isinstance(policy, WrappedPolicy) and policy.bounds is not None:
+            warnings.warn(name_ambiguities(policy.policy.action_space, ())[-1], EgoWarning, stacklevel=2)
+        self._decisions = round(horizon * env.scene.config["policy_frequency"])
+        if self._decisions < 1:
+            raise ValueError(f"Expected a horizon of one decision of HighwayEnv or more, got {horizon!r} s.")
+        if env.scene.config["manual_control"]:
+            raise ValueError("Expected manual_control False, got True: HighwayEnv would not carry out the actions.")
         self.space: ScenarioSpace = env.space
         self.dim, self.column_names, self.base = env.space.dim, env.space.column_names, env.space.base
         self.fixed: dict[str, Any] = env.fixed
@@ -180,7 +192,7 @@ class HighwayEnvProblem:
         if policy is None:
             replace_ego_by_idm(env)
         state = None
-        for step in range(round(self._seconds * env.scene.config["policy_frequency"])):
+        for step in range(self._decisions):
             if policy is not None:
                 begun, seen = np.array([step == 0]), np.asarray(observation)[None]
                 with as_errors():
@@ -196,7 +208,7 @@ class HighwayEnvProblem:
     @cached_property
     def _driven(self) -> tuple[HighwayEnvScenario, Any]:
         """The environment, made where it is first needed, and the policy; None for HighwayEnv's IDM."""
-        env = HighwayEnvScenario(make_highway_env(self.env_id, self._config), **self._settings)
+        env = HighwayEnvScenario(make_highway_env(self.env_id, self.config), **self._settings)
         install_fast_observation(env.scene, blind=self._policy is None)
         return env, None if self._policy is None else make_policy(self._policy, env)
 

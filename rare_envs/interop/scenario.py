@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from numbers import Real
 from typing import Any
 
 import gymnasium as gym
@@ -10,8 +11,6 @@ import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.observation import KinematicObservation
-from highway_env.envs.merge_env import MergeGenericEnv
-from highway_env.envs.roundabout_env import RoundaboutGenericEnv
 from highway_env.utils import class_from_path, lmap
 from numpy.typing import NDArray
 
@@ -21,6 +20,8 @@ from rare_envs.distributions.product import NoiseDistribution
 from rare_envs.distributions.space import Parameter, ScenarioSpace
 from rare_envs.interop.layouts import (
     LAYOUTS,
+    SCENE_METHODS,
+    STARTING_METHODS,
     Group,
     Layout,
     idm_groups,
@@ -137,6 +138,8 @@ def observe_without_pandas(kind: Any) -> NDArray[np.float32]:
 
 
 _FIXED_SEED = 12345
+HIGHWAY_ENV = "highway_env."
+"""HighwayEnv's modules begin with it."""
 
 
 class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
@@ -191,6 +194,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         """
         super().__init__(env)
         self.layout = _find_layout(env)
+        self._kind = class_from_path(self.scene.config["other_vehicles_type"])
         if not callable(measure):
             check_name("measure", measure, HIGHWAY_ENV_MEASURES)
         self._measure = measure if callable(measure) else HIGHWAY_ENV_MEASURES[measure]
@@ -198,7 +202,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"Expected noise True or 'fixed', got {noise!r}.")
         self._rng = np.random.default_rng()
         self.layout.prepare(self.scene)
-        groups = self.layout.groups(self.scene, self._count_vehicles(vehicles)) + idm_groups(self.layout)
+        groups = self.layout.groups(self.scene, self._count_vehicles(vehicles)) + idm_groups(self.layout, self._kind)
         self.fixed = _hold_parameters(groups, fixed)
         varying = [group for group in groups if group.parameters[0].name not in self.fixed]
         self.space = _make_space(varying, self.layout.leftover and noise is True, base)
@@ -238,7 +242,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         self._x = self.space.scenario_x(options, 1, self._rng)[0]
         scene, values = self.scene, self._values()
         noise = values.get("noise")
-        with restore_class_parameters(class_from_path(scene.config["other_vehicles_type"])):
+        with restore_class_parameters(self._kind):
             self.env.reset(seed=_FIXED_SEED if noise is None else int(np.float64(noise).view(np.uint64)))
         self.layout.arrange(scene, values)
         set_idm(others_of(scene), values)
@@ -299,12 +303,26 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
         raise ValueError(f"Expected an environment of HighwayEnv ({', '.join(HIGHWAY_ENV_IDS)}), got {env}.")
     if plain is not inner:
         raise ValueError(f"Expected the environment as gym.make gives it, got {plain}; put wrappers around this one.")
-    layout = next((layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind)), None)
-    generic = isinstance(inner, MergeGenericEnv | RoundaboutGenericEnv)
-    if layout is None or generic or len(inner.controlled_vehicles) != 1:
-        known = ", ".join(HIGHWAY_ENV_IDS)
-        raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {known}, with one ego.")
-    return layout
+    known = next((kind for kind in LAYOUTS if isinstance(inner, kind)), None)
+    names = f"{', '.join(HIGHWAY_ENV_IDS)}, with one ego"
+    if known is None or len(inner.controlled_vehicles) != 1 or isinstance(inner.action_space, gym.spaces.Tuple):
+        raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {names}.")
+    kind: type = class_from_path(inner.config["other_vehicles_type"])
+    places = {name: getattr(getattr(kind, name, None), "__module__", HIGHWAY_ENV) for name in STARTING_METHODS}
+    functions = {name: getattr(getattr(inner, name, None), "__func__", None) for name in SCENE_METHODS}
+    own = [f"{kind.__name__}.{name}" for name, place in places.items() if not place.startswith(HIGHWAY_ENV)]
+    own += [f"{type(inner).__name__}.{name}" for name, it in functions.items() if it is not getattr(known, name, None)]
+    if own:
+        raise ValueError(
+            f"No parameters are known for the scene by {own[0]}, which is not {known.__name__}'s; expected {names}."
+        )
+    simulated, decided = (inner.config[f"{name}_frequency"] for name in ("simulation", "policy"))
+    if not all(isinstance(each, Real) and each > 0 for each in (simulated, decided)) or simulated < decided:
+        raise ValueError(
+            f"Expected policy_frequency above 0 and at most simulation_frequency, got {decided!r} and {simulated!r}: "
+            "HighwayEnv would simulate no step from one decision to the next, so that nothing moves."
+        )
+    return LAYOUTS[known]
 
 
 def _hold_parameters(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:

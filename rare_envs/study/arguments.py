@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import json
 import math
 import os
 import reprlib
@@ -361,18 +362,43 @@ def read_question_file(path: Path) -> dict[str, Any]:
     return {KEYS[name].name: value for name, value in values.items()}
 
 
-def _read_nodes(path: Path) -> list[tuple[str, Any]]:
-    """Return the keys of a YAML file with their nodes; no object is made of any."""
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Return the mapping of any depth that a YAML file, which may be JSON, has."""
+    import yaml
+
+    node = _read_yaml(path)
+    try:
+        value = None if node is None else yaml.SafeLoader("").construct_document(node)
+        json.dumps(value, allow_nan=False)  # as the answer repeats it
+    except (yaml.YAMLError, RecursionError, TypeError, ValueError) as error:
+        raise BadInput(f"Expected {str(path)!r} to have texts, finite numbers and lists of them: {error}.") from error
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise BadInput(f"Expected {str(path)!r} to have keys and values, as in vehicles_count: 20.")
+    return value
+
+
+def _read_yaml(path: Path) -> Any:
+    """Return the node of a YAML file; no object is made of any."""
     import yaml
 
     try:
-        node = yaml.compose(read_text_file(path, MAX_QUESTION_BYTES), Loader=yaml.SafeLoader)
+        text = read_text_file(path, MAX_QUESTION_BYTES)
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):  # a few bytes become gigabytes
+            raise BadInput(f"{str(path)!r} repeats earlier values by *name: write them out.")
+        return yaml.compose(text, Loader=yaml.SafeLoader)
     except OSError as error:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise BadInput(f"{str(path)!r} is no YAML: {error}") from error
     except ValueError as error:
         raise BadInput(str(error)) from error
+
+
+def _read_nodes(path: Path) -> list[tuple[str, Any]]:
+    """Return the keys of a YAML file with their nodes."""
+    import yaml
+
+    node = _read_yaml(path)
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     if not pairs or not all(isinstance(key, yaml.ScalarNode) for key, _ in pairs):
         has = "has no keys: expected" if node is None else "cannot be used: expected"

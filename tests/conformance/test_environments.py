@@ -96,6 +96,23 @@ def test_batches_behind_every_vector_wrapper(env_id, observation, action):
         assert ended >= 3, name
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "steps"), [({}, 100), ({"horizon": 20.0}, 200), ({"action": "meta"}, 10), ({"max_episode_steps": 5}, 5)]
+)
+def test_the_length_of_an_episode_is_in_the_spec(kwargs, steps):
+    """So what Gymnasium makes of it, as one or as a batch, again from the spec too, ends then."""
+    one, batch = (make("rare_envs/CarFollowing-v0", **kwargs) for make in (gym.make, gym.make_vec))
+    assert (one.spec.max_episode_steps, batch.spec.max_episode_steps) == (steps, steps)
+    one, batch = wrappers.TimeAwareObservation(gym.make(one.spec)), gym.make_vec(batch.spec)
+    x = [20.0, 20.0, 100.0]
+    one.reset(options={"x": x})
+    batch.reset(options={"x": x})
+    ends = []
+    for _ in range(steps):
+        ends.append((one.step(one.action_space.sample() * 0)[3], bool(batch.step(batch.action_space.sample() * 0)[3])))
+    assert ends == [(False, False)] * (steps - 1) + [(True, True)]
+
+
 class Recorded:
     """An ego with a fixed sequence of actions, whatever it sees."""
 

@@ -17,6 +17,7 @@ from rare_envs.study.arguments import (
     Question,
     as_bad_input,
     output_file,
+    read_mapping,
     read_question_file,
 )
 from rare_envs.study.cli import shell
@@ -29,7 +30,7 @@ NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
 OPTIONS = frozenset(
     "env ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
-    "workers executor address time_limit memory_limit config out force as_json".split()
+    "workers executor address time_limit memory_limit config env_config out force as_json".split()
 )
 """Parameters of the command that HighwayEnv's environments have; the others are of the batched simulation."""
 ESTIMATE_FILE = "estimate.safetensors"
@@ -48,6 +49,9 @@ def estimate_command(
     ] = None,
     config: Annotated[
         Path | None, Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
+    ] = None,
+    env_config: Annotated[
+        Path | None, Option(help="JSON or YAML file of HighwayEnv's config, such as the ego's observation there.")
     ] = None,
     out: Annotated[Path | None, Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
     force: shell.ForceOption = False,
@@ -74,7 +78,10 @@ def estimate_command(
                 f"{question.env_id!r} is an environment of HighwayEnv, which has no --{refused[0].replace('_', '-')}; "
                 f"expected {', '.join(rare_envs.ENV_IDS)} with it."
             )
-        return estimate_highway_env(question, out, force, executor)
+        env_settings = None if env_config is None else read_mapping(env_config)
+        return estimate_highway_env(question, env_settings, out, force, executor)
+    if env_config is not None:
+        raise BadInput(f"Expected --env-config with an environment of HighwayEnv, such as highway-fast-v0, got {env}.")
 
     from rare_envs.study.evaluate import run, run_into
     from rare_envs.study.question import prepare
@@ -103,13 +110,18 @@ def format_seconds(seconds: float) -> str:
     return f"{seconds / 3600:,.0f} h"
 
 
-def estimate_highway_env(question: Question, out: Path | None, force: bool, executor: Executor | None) -> Answer:
+def estimate_highway_env(
+    question: Question, config: dict[str, Any] | None, out: Path | None, force: bool, executor: Executor | None
+) -> Answer:
     """Estimate how often an ego crashes in one of HighwayEnv's environments, as that environment draws its traffic."""
     import agents
     import rare_envs
     import samplers
     from rare_envs.study.arguments import FIRST_BATCH, RunInterrupted, describe_stop
 
+    vehicles = str((config or {}).get("other_vehicles_type", "highway_env."))
+    if not vehicles.startswith("highway_env.") and not question.trust:
+        raise BadInput(f"The file of --env-config names code, {vehicles!r}: let it run by --trust.")
     file = None if out is None else out / ESTIMATE_FILE
     if file is not None and file.exists() and not force:
         raise BadInput(f"There is a finished run in {str(out)!r} ({ESTIMATE_FILE}): replace it by --force.")
@@ -118,7 +130,8 @@ def estimate_highway_env(question: Question, out: Path | None, force: bool, exec
         method = samplers.get_method(question.method)
         arguments = {name: getattr(question.run_arguments, name) for name in names}
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
-        settings: dict[str, Any] = {} if question.horizon is None else {"horizon": question.horizon}
+        settings: dict[str, Any] = {"config": config}
+        settings |= {} if question.horizon is None else {"horizon": question.horizon}
         problem = rare_envs.highway_env_problem(
             question.env_id, ego, measure=question.measure, noise=question.noise, fixed="highway_env", **settings
         )
@@ -152,6 +165,7 @@ def _describe(question: Question, problem: Any, result: Estimate, out: Path | No
         lines.append(f"  most likely failure: {', '.join(f'{name} {value}' for name, value in likeliest.items())}")
     lines += [] if out is None else [f"Wrote {out}."]
     about = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
+    about["env_config"] = problem.config
     data = {**result.to_dict(), **about, "doubtful": bool(shown.warnings)}
     return Answer(data, "\n".join(lines), DOUBTFUL if shown.warnings else 0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -103,6 +104,11 @@ def test_a_policy_of_highway_env_says_by_its_id_or_by_hand_what_its_actions_are(
         problem = rare_envs.DrivingProblem(env_id, ego=ego, **asked)
         assert (problem.world.sensing.observation, problem.world.clock.action) == ("kinematics", action)
         assert problem.notes == ()
+    steering = idle(observation_space(3, "kinematics"), spaces.Box(-1.0, 1.0, (2,)))
+    for make in (rare_envs.DrivingProblem, partial(rare_envs.parallel_env, observation="kinematics")):
+        with pytest.raises(ValueError, match=r"fit two kinds: acceleration .*--action continuous.* ContinuousAction"):
+            make(CUT_IN, ego=steering)
+        assert make(CUT_IN, ego=steering, action="continuous").world.clock.action == "continuous"
 
 
 def test_other_policies_are_taken_to_accelerate() -> None:

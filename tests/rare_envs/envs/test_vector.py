@@ -128,6 +128,25 @@ def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:
     assert not truncated.any()
 
 
+def test_each_seed_of_a_list_is_that_of_a_single_environment() -> None:
+    """It draws what the single one draws, at the start and after an end, behind others too."""
+    batch, still = rare_envs.make_batch("rare_envs/CutIn-v0", 3, horizon=0.1), np.zeros((3, 2), np.float32)
+    singles, seeds = [gym.make("rare_envs/CutIn-v0") for _ in range(3)], [5, 5, 9]
+    first = [env.reset(seed=seed)[1]["x"] for env, seed in zip(singles, seeds, strict=True)]
+    np.testing.assert_array_equal(batch.reset(seed=seeds)[1]["x"], first)
+    for _ in range(2):
+        np.testing.assert_array_equal(batch.step(still)[-1]["x"], [env.reset()[1]["x"] for env in singles])
+        kept = batch.export_state()
+        batch.reset(seed=0)
+        batch.restore_state(kept)
+    mask = np.array([True, False, False])
+    batch.reset(seed=[9, 9, None], options={"reset_mask": mask})
+    after = [env.reset(seed=seed)[1]["x"] for env, seed in zip(singles, (9, None, None), strict=True)]
+    np.testing.assert_array_equal(batch._x[0], after[0])
+    with pytest.raises(ValueError, match="one seed for each of 3 environments, got 2"):
+        batch.reset(seed=[1, 2])
+
+
 @pytest.mark.parametrize("mask", [np.zeros(2, bool), np.ones(3, bool), np.array([1, 0])])
 def test_a_wrong_mask_or_mode_is_refused(mask: np.ndarray) -> None:
     batch = rare_envs.make_batch("rare_envs/CutIn-v0", 2)

@@ -3,6 +3,7 @@
 import pickle
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from scipy import integrate
@@ -11,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 import samplers
+from rare_envs.egos.needs import EgoWarning
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.problem import BarePolicy, make_highway_env
 from tests.rare_envs.interop.egos import Always, faster
@@ -96,12 +98,21 @@ def test_bad_input_is_refused_at_the_door() -> None:
         (lambda: 3, {}, "got int from <function"),
         (lambda observation: 1, {}, "a function without arguments that makes one, got .* which fails: TypeError"),
         (IDLE, {"horizon": -1.0}, "horizon in seconds"),
+        (IDLE, {"horizon": 0.4}, "horizon of one decision of HighwayEnv or more, got 0.4 s"),
     ]
     for ego, kwargs, message in cases:
         with pytest.raises(ValueError, match=message):
             fast(ego, **kwargs)
-    with pytest.raises(ValueError, match="did you mean 'vehicles_count'"):
-        rare_envs.highway_env_problem("highway-fast-v0", ego="idm", config={"vehicle_count": 3})
+    configs: list[tuple[dict[str, Any], str]] = [
+        ({"vehicle_count": 3}, "did you mean 'vehicles_count'"),
+        ({"observation": "Kinematics"}, "HighwayEnv makes no highway-fast-v0 of the config .*: TypeError"),
+        ({"manual_control": True}, "would not carry out the actions"),
+        ({"policy_frequency": 6}, "policy_frequency above 0 and at most simulation_frequency, got 6 and 5"),
+        ({"policy_frequency": -1}, "at most simulation_frequency, got -1 and 5: .* nothing moves"),
+    ]
+    for config, message in configs:
+        with pytest.raises(ValueError, match=message):
+            rare_envs.highway_env_problem("highway-fast-v0", ego="idm", config=config)
     with pytest.raises(ValueError, match="key of the config of merge-v0 'duration'"):  # it ends at a place
         rare_envs.highway_env_problem("merge-v0", ego="idm", config={"duration": 5})
     problem = fast(Always(np.nan))
@@ -112,6 +123,13 @@ def test_bad_input_is_refused_at_the_door() -> None:
         fast(measure=lambda env: np.nan).evaluate(x)
     with pytest.raises(ValueError, match=r"gap\[0\] = 400"):
         problem.evaluate(np.where(np.arange(problem.dim) == 4, 400.0, x))
+
+
+def test_actions_with_bounds_of_their_own_are_mapped_with_a_warning() -> None:
+    ego, config = Always([0.0, 0.0]), {**FAST, "action": {"type": "ContinuousAction"}}
+    ego.action_space = gym.spaces.Box(-0.5, 0.5, (2,))  # type: ignore[attr-defined]
+    with pytest.warns(EgoWarning, match=r"between \[-0.5, -0.5\] and \[0.5, 0.5\], are mapped to \[-1, 1\]"):
+        rare_envs.highway_env_problem("highway-fast-v0", ego, config=config)
 
 
 @pytest.mark.slow

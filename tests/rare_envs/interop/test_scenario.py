@@ -6,6 +6,7 @@ import gymnasium as gym
 import highway_env  # noqa: F401  (registers the ids)
 import numpy as np
 import pytest
+from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.vehicle.behavior import IDMVehicle
 from scipy import stats
 
@@ -90,6 +91,46 @@ def read_back(env: Any, env_id: str) -> dict[str, Any]:
     return {**given, "speed": [v.speed for v in ranked], "lane": [v.lane_index[2] for v in ranked]}
 
 
+class Tailgater(IDMVehicle):
+    TIME_WANTED, DISTANCE_WANTED = 0.3, 6.0
+
+
+class Hasty(IDMVehicle):
+    def randomize_behavior(self) -> None:
+        self.target_speed = 35.0
+
+
+class SlowTraffic(HighwayEnvFast):
+    def _create_vehicles(self) -> None:
+        super()._create_vehicles()
+        self.road.vehicles[-1].speed = 0.0
+
+
+class Lap(HighwayEnvFast):
+    def _is_truncated(self) -> bool:
+        return bool(self.time >= 2)
+
+
+def test_a_class_of_the_users_is_taken_only_where_its_scene_is_the_known_one() -> None:
+    def of(kind: type) -> Any:
+        return make_highway_env("highway-fast-v0", {**SMALL, "other_vehicles_type": f"{__name__}.{kind.__name__}"})
+
+    patched = make_highway_env("highway-fast-v0", SMALL)
+    patched.unwrapped._create_vehicles = lambda: None  # type: ignore[attr-defined]
+    for env, message in (
+        (gym.make("exit-v1"), "scene by ConnectedLaneExitEnv._reset, which is not HighwayEnv's"),
+        (SlowTraffic(SMALL), "SlowTraffic._create_vehicles, which is not HighwayEnvFast's"),
+        (patched, "scene by HighwayEnvFast._create_vehicles"),
+        (of(Hasty), "scene by Hasty.randomize_behavior"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            HighwayEnvScenario(env)
+    assert HighwayEnvScenario(of(Tailgater), fixed="highway_env").fixed["time_headway"] == 0.3
+    env = HighwayEnvScenario(Lap(SMALL))
+    env.reset(seed=0)
+    assert [env.step(1)[3] for _ in range(2)] == [False, True]
+
+
 def test_highway_options_are_what_the_scene_then_has() -> None:
     env = scenario("highway-fast-v0", vehicles=3)
     lanes = [2, 0, 1]
@@ -128,7 +169,10 @@ def test_intersection_and_roundabout_options_are_what_the_scene_then_has() -> No
 
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1"])
 def test_a_scene_of_highway_env_put_back_by_its_parameters_drives_the_same(env_id: str) -> None:
-    plain, env = make_highway_env(env_id, CONFIGS[env_id]), scenario(env_id, fixed="highway_env")
+    """With vehicles that want gaps of their own in the merge."""
+    config = {"other_vehicles_type": f"{__name__}.Tailgater"} if env_id == "merge-v1" else CONFIGS[env_id]
+    plain, env = (make_highway_env(env_id, config) for _ in range(2))
+    env = HighwayEnvScenario(env, fixed="highway_env")
     observation, _ = plain.reset(seed=3)
     given = read_back(plain, env_id)
     if "noise" in env.space.names:

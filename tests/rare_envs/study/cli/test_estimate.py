@@ -178,6 +178,26 @@ def test_a_policy_from_there_is_estimated_there(cli: Cli, saved: Path, tmp_path:
     assert text.startswith(f"highway-fast-v0, ego {saved}\nP[f <= 0] ") and "what it holds fixed is held" in text
 
 
+def test_a_policy_of_another_config_is_estimated_in_it(cli: Cli, tmp_path: Path) -> None:
+    """The message names the option that helps; a file may be JSON or YAML, and names no code by itself."""
+    config = {"observation": {"type": "Kinematics", "vehicles_count": 7}, "vehicles_count": 3}
+    files = {"wide.json": json.dumps(config), "wide.yaml": "observation: {type: Kinematics, vehicles_count: 7}"}
+    files |= {"twice.yaml": "a: &a {b: 1}\nc: *a", "list.json": "[]", "code.json": '{"other_vehicles_type": "mine.It"}'}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    path = tmp_path / "wide.zip"
+    env: Any = gym.make("highway-fast-v0", config=config)
+    DQN("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, buffer_size=10, seed=0, device="cpu").save(path)
+    words = ("estimate", "highway-fast-v0", "--ego", path, "--method", "mc", "--max-sim", 2, "--horizon", 1, "--json")
+    assert_refused(cli(*words), "--env-config FILE")
+    for name in ("wide.json", "wide.yaml"):
+        answer = json.loads(cli(*words, "--env-config", tmp_path / name).stdout)
+        assert (answer["n_sim"], answer["env_config"]["observation"]) == (2, config["observation"])
+    for name, said in (("twice.yaml", "*name"), ("list.json", "keys and values"), ("code.json", "--trust")):
+        assert_refused(cli(*words, "--env-config", tmp_path / name), said)
+    assert_refused(cli("estimate", "CutIn-v0", "--env-config", tmp_path / "wide.json"), "environment of HighwayEnv")
+
+
 def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
     words = ("estimate", "highway-fast-v0", "--method", "mc", "--max-sim", 4, "--horizon", 1, "--gamma", -99)
     answer, text = json.loads(cli(*words, "--json").stdout), cli(*words)
