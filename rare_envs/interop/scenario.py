@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from numbers import Real
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.observation import KinematicObservation
@@ -142,7 +142,7 @@ HIGHWAY_ENV = "highway_env."
 """HighwayEnv's modules begin with it."""
 
 
-class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
+class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A HighwayEnv environment with scenario parameters as reset options, and a base distribution over them.
 
     `reset(options={"gap": [20.0, 15.0, 30.0, 30.0], "ego_speed": 28.0})` sets these; what is not given is drawn from
@@ -192,7 +192,8 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         Raises:
             ValueError: If the environment is not one of HighwayEnv's that are known here, or an argument is invalid.
         """
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, vehicles=vehicles, measure=measure, fixed=fixed, noise=noise, base=base)
+        gym.Wrapper.__init__(self, env)
         self.layout = _find_layout(env)
         self._kind = class_from_path(self.scene.config["other_vehicles_type"])
         if not callable(measure):
@@ -238,7 +239,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
             ValueError: If an option is unknown, held, of the wrong shape, NaN or outside its range.
         """
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._rng, _ = seeding.np_random(seed)
         self._x = self.space.scenario_x(options, 1, self._rng)[0]
         scene, values = self.scene, self._values()
         noise = values.get("noise")
@@ -317,7 +318,10 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
             f"No parameters are known for the scene by {own[0]}, which is not {known.__name__}'s; expected {names}."
         )
     simulated, decided = (inner.config[f"{name}_frequency"] for name in ("simulation", "policy"))
-    if not all(isinstance(each, Real) and each > 0 for each in (simulated, decided)) or simulated < decided:
+    if (
+        not all(isinstance(each, int | float | np.number) and each > 0 for each in (simulated, decided))
+        or simulated < decided
+    ):
         raise ValueError(
             f"Expected policy_frequency above 0 and at most simulation_frequency, got {decided!r} and {simulated!r}: "
             "HighwayEnv would simulate no step from one decision to the next, so that nothing moves."

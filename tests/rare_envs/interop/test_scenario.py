@@ -6,6 +6,7 @@ import gymnasium as gym
 import highway_env  # noqa: F401  (registers the ids)
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.vehicle.behavior import IDMVehicle
 from scipy import stats
@@ -70,6 +71,12 @@ def test_wrong_environments_and_settings_are_refused() -> None:
         scenario("merge-v1", vehicles=2)
     with pytest.raises(ValueError, match="did you mean 'highway-fast-v0'"):
         make_highway_env("highway-fst-v0", None)
+
+
+def test_gymnasiums_checker_takes_it_and_makes_it_again() -> None:
+    env = scenario("highway-fast-v0", vehicles=2)
+    check_env(env, skip_render_check=True)
+    assert gym.make(env.spec).space.names == env.space.names  # type: ignore[attr-defined]
 
 
 def read_back(env: Any, env_id: str) -> dict[str, Any]:
