@@ -8,28 +8,38 @@ of its batch gives an f that is none, and a p that means nothing; at the first c
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
+import pickle
 import reprlib
 import shlex
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch
 
 import agents
 import samplers
-from agents.loading import find_ego_kind
+from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.egos.needs import RULE_BASED_EGOS
+from rare_envs.egos.policy import PolicyDriver
+from rare_envs.egos.wrappers import WrappedPolicy
 from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import EgoGone
 from rare_envs.problem import DrivingProblem
+from rare_envs.simulation.world import rollout
 from rare_envs.startup import __version__
 from rare_envs.study import arguments, writing
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
+from rare_envs.study.ego_check.checks import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures
 from rare_envs.study.question import Study, build_problem, digest_files, find_changed_files, open_question, prepare
@@ -41,7 +51,7 @@ from samplers.journal import Journal
 from samplers.problem import FloatArray, OnError
 from samplers.workers import ExecutorError
 
-KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
+KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 8
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
 COMPARISON = "comparison.json"
 UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity")
@@ -209,7 +219,72 @@ def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
     before = f[np.concatenate(batches)]
     changed = find_changed(again, before)
     apart = np.nan_to_num(np.abs(again[changed] - before[changed]), nan=np.inf)
-    return Repeatability(len(again), int(changed.sum()), float(apart.max(initial=0.0)))
+    n_elsewhere = count_other_answers(study, x[:COMPANY])
+    return Repeatability(len(again), int(changed.sum()), float(apart.max(initial=0.0)), n_elsewhere)
+
+
+N_PROCESSES, N_ASKED, ASKED_EVERY = 4, 8, 10
+"""Other processes, queries of one episode that are made again in each, and ticks between them."""
+ELSEWHERE_TIMEOUT = 60.0
+"""How long that process may take [s]."""
+_ELSEWHERE = """
+import importlib, os, pickle, sys
+answer, sys.path[:0] = os.dup(1), [""]
+os.dup2(2, 1)
+module, name, queries = pickle.load(sys.stdin.buffer)
+ego = getattr(importlib.import_module(module), name)()
+if not hasattr(ego, "predict"):
+    from rare_envs.egos.needs import wrap_callable
+    ego = wrap_callable(ego)
+found = [ego.predict(seen, state=None, episode_start=start, deterministic=True)[0] for seen, start in queries]
+with os.fdopen(answer, "wb") as file:
+    pickle.dump(found, file)
+    file.flush()
+    os._exit(0)
+"""
+"""Program of that process, which imports nothing slow."""
+
+
+class _Recorder:
+    """A policy that keeps some of its queries without a memory, and its answers."""
+
+    def __init__(self, policy: Any) -> None:
+        self.policy, self.calls, self.kept = policy, 0, list[tuple[Any, ...]]()
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, **how: Any) -> Any:
+        """Answer as the policy does."""
+        seen = copy.deepcopy(observation)
+        action, after = self.policy.predict(observation, state=state, episode_start=episode_start, **how)
+        if state is None and self.calls % ASKED_EVERY == 0 and len(self.kept) < N_ASKED:
+            self.kept.append((seen, episode_start, np.array(action)))
+        self.calls += 1
+        return action, after
+
+
+def count_other_answers(study: Study, x: FloatArray) -> int:
+    """Return how many answers of an ego `module:function`, driving scenarios x, are others in other processes."""
+    name, driver = strip_prefixes(study.question.ego), study.problem.driver
+    if study.ego_was_given or find_ego_kind(name) != "function" or not isinstance(driver, PolicyDriver):
+        return 0
+    recorder = _Recorder(driver.policy.policy if isinstance(driver.policy, WrappedPolicy) else driver.policy)
+    policy = replace(driver.policy, policy=recorder) if isinstance(driver.policy, WrappedPolicy) else recorder
+    try:
+        rollout(study.problem.world, replace(driver, policy=policy), torch.from_numpy(x).float())
+        queries = [(seen, start) for seen, start, _ in recorder.kept]
+        message = pickle.dumps((*name.split(":"), queries))
+        own = np.concatenate([action.reshape(len(action), -1) for _, _, action in recorder.kept])
+        with ThreadPoolExecutor(N_PROCESSES) as threads:
+            apart = np.abs([answer - own for answer in threads.map(_ask_elsewhere, [message] * N_PROCESSES)])
+    except (Exception, EgoGone):  # it does not answer there at all: nothing is known
+        return 0
+    return int((apart.max(axis=(0, 2)) > ACTION_ROUNDING).sum())
+
+
+def _ask_elsewhere(message: bytes) -> FloatArray:
+    """Return the answers to all queries of a message in another process, one row each."""
+    program = [sys.executable, "-c", _ELSEWHERE]
+    done = subprocess.run(program, input=message, stdout=-1, stderr=-3, timeout=ELSEWHERE_TIMEOUT, check=True)
+    return np.concatenate([np.reshape(action, (len(action), -1)).astype(float) for action in pickle.loads(done.stdout)])
 
 
 def run_into(

@@ -36,8 +36,6 @@ from samplers.analysis.reweight import refit_quantile
 from samplers.evaluate import Fault
 from samplers.sample import Interval
 
-MOST_DIFFERING = 0.05
-"""Share of simulations that may differ by more: a choice between two actions may hang on rounding in a rare one."""
 N_THRESHOLDS = 25
 REACH = 0.5
 """P[f <= g] at the largest threshold."""
@@ -118,17 +116,24 @@ class Repeatability(NamedTuple):
     """With another f."""
     largest: float
     """Largest difference of f."""
+    n_elsewhere: int = 0
+    """Answers of an ego `module:function` that are others in another process."""
 
     @property
     def warning(self) -> str:
-        """Doubt about p; "" if few or none differ."""
-        if self.n_differing <= MOST_DIFFERING * self.n:
-            return ""
-        return (
-            f"of {self.n} simulations done again in another order and company {self.n_differing} gave another f, by up "
-            f"to {self.largest:.3g}: the ego or the measure is random, keeps something from one call to the next, or "
-            "mixes the rows of a batch, so p may be wrong by any factor; rare-envs check-ego may say where"
-        )
+        """Doubt about p; "" if none differ."""
+        if self.n_differing:
+            return (
+                f"of {self.n} simulations done again in another order and company {self.n_differing} gave another f, "
+                f"by up to {self.largest:.3g}: the ego or the measure is random, keeps something from one call to the "
+                "next, or mixes the rows of a batch, so p may be wrong by any factor; rare-envs check-ego may say where"
+            )
+        if self.n_elsewhere:
+            return (
+                f"{self.n_elsewhere} answers of the ego are others in another process: they depend on its number, its "
+                "hashes (PYTHONHASHSEED) or something else of it, so p is that of this process alone"
+            )
+        return ""
 
 
 def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.Verdict:

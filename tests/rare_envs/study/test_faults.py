@@ -216,7 +216,13 @@ class Mixing(Braking):
         return np.clip(0.5 + (seen := observation.sum(axis=1)) - seen.mean(), 0.0, 1.0)
 
 
-@pytest.mark.parametrize("ego", [RandomLater, Counting, Mixing])
+class RightInItsFirstRow(Braking):
+    def share(self, observation: np.ndarray) -> Any:
+        share = np.clip(observation.sum(axis=1), 0.0, 1.0)
+        return np.append(share[:1], 0.5 * share[1:])
+
+
+@pytest.mark.parametrize("ego", [RandomLater, Counting, Mixing, RightInItsFirstRow])
 def test_an_ego_without_an_f_is_noticed(ego: type[Braking]) -> None:
     report = run(prepare(QUESTION, ego=ego()))
     assert report.doubtful
@@ -231,6 +237,19 @@ def test_others_are_not_suspected(ego: Any) -> None:
     found = run(prepare(QUESTION, ego=agents.load_ego(ego) if isinstance(ego, str) else ego)).repeatability
     assert found is not None
     assert (found.n, found.n_differing, found.warning) == (KEPT_ROWS + ROWS_ALONE, 0, "")
+
+
+def test_an_ego_that_depends_on_its_process_is_noticed(here: Path) -> None:
+    (here / "hashed.py").write_text(
+        "import os\nimport numpy as np\n\nclass Ego:\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
+        "        return np.full((len(observation), 2), os.getpid() % 97 / 97.0), state\n"
+        "same = Ego\n"
+    )
+    (here / "steady.py").write_text((here / "hashed.py").read_text().replace("os.getpid()", "9"))
+    found = {name: run(prepare(replace(QUESTION, ego=f"{name}:same"))) for name in ("hashed", "steady")}
+    assert found["hashed"].doubtful and "in another process" in found["hashed"].warnings[-1]
+    assert "in another process" not in str(found["steady"].warnings)
 
 
 ASKED = Question(
