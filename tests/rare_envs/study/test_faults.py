@@ -219,7 +219,7 @@ class Mixing(Braking):
 class RightInItsFirstRow(Braking):
     def share(self, observation: np.ndarray) -> Any:
         share = np.clip(observation.sum(axis=1), 0.0, 1.0)
-        return np.append(share[:1], 0.5 * share[1:])
+        return np.append(share[:1], -share[1:])
 
 
 @pytest.mark.parametrize("ego", [RandomLater, Counting, Mixing, RightInItsFirstRow])
