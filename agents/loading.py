@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from os import PathLike
+from os.path import isfile
 from pathlib import Path
 from typing import Any, Final, Protocol, cast, runtime_checkable
 from urllib.parse import parse_qsl
@@ -235,7 +236,7 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
     ),
     "onnx": (lambda spec: spec.endswith(".onnx"), _load_onnx),
     "zip": (
-        lambda spec: spec.endswith(".zip") or Path(spec).is_file(),
+        lambda spec: spec.endswith(".zip") or isfile(spec),  # of too long a name too
         lambda text, *how: load_saved_ego(Path(text), *how),
     ),
     "function": (names_function, _call_factory),

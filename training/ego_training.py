@@ -314,9 +314,9 @@ def _fit_to_run(hyperparameters: Hyperparameters, num_envs: int, steps: int) -> 
 
 def _prepare_target(out: Path) -> Path:
     """Return the file to write, with its folder made; a ValueError if it cannot be written."""
-    if out.is_dir():
-        raise ValueError(f"Expected a file to write, got the folder {str(out)!r}; name a .zip.")
     target = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
+    for folder in filter(Path.is_dir, (out, target)):
+        raise ValueError(f"Expected a file to write, got the folder {str(folder)!r}; name a .zip.")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -52,9 +52,10 @@ NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
-STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.usetex": False}
-"""Settings of matplotlib for every picture. Each is a `Figure` of its own, without pyplot: no window, no global state,
-whatever backend the user has."""
+STYLE: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if "backend" not in name}
+STYLE |= {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+"""Settings of matplotlib for every picture, whatever a matplotlibrc says, which may lie in the folder of somebody else.
+Each is a `Figure` of its own, without pyplot: no window, no global state, whatever backend the user has."""
 DOTS_PER_INCH = 120
 """Resolution of every picture."""
 MOST_LETTERS = 1_000

@@ -209,7 +209,7 @@ def begin_study_file(folder: Path, study: Study) -> None:
 def note_resumption(folder: Path, earlier_seconds: float) -> None:
     """Note in study.json that an interrupted run of so many seconds goes on; one that cannot be read is left."""
     _remove_drafts(folder)
-    if about := read_about(folder):
+    if "question" in (about := read_about(folder)):
         with suppress(OSError):  # a full disk is found when results are written
             _write_study_file(folder, about | {"resumed": _now(), "earlier_seconds": earlier_seconds})
 
@@ -219,8 +219,8 @@ def finish_run(folder: Path, report: Report) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_run(folder, report)
-        begun = read_about(folder)  # stays, but for one of another question, which somebody has put there
-        if not begun or ("question" in begun and not is_same_question(begun["question"], report.study.question)):
+        begun = read_about(folder)  # stays, but for what somebody has put there: of another question, or of none
+        if not is_same_question(begun.get("question"), report.study.question):
             begun = describe_study(report.study)
         digests = {name: digest_file(folder / name) for name in run_folder.DIGESTED if (folder / name).is_file()}
         ended = {"finished": _now(), "seconds": report.seconds, "results": digests}

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 
@@ -159,7 +160,10 @@ def test_the_process_of_an_ego_finds_no_modules_in_the_working_directory(receive
     assert not Path("was_here").exists()
 
 
-def test_nothing_is_written_through_the_links_of_a_folder(received: Path, tmp_path: Path) -> None:
+def test_nothing_is_written_through_the_links_of_a_folder_nor_taken_from_its_matplotlibrc(
+    received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)
     outside = tmp_path / "outside"
     (outside / "figures").mkdir(parents=True)
     (outside / "precious").write_text("precious")
@@ -199,8 +203,10 @@ def test_values_of_every_field_are_taken_back_and_what_is_no_code_is_not_listed(
     recorded = json.loads(json.dumps(asdict(question)))
     assert open_question({**recorded, "unknown": 1}, received, trust=True) == question
     Path("evil:make").touch()  # which need not be there when the ego is loaded
-    for ego in ("idm", "ego.zip", "noisy:gail", "human:no-headway-rule", "process:imitation?timeout=3", "evil:make"):
-        assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == ({"ego": ego} if ego == "evil:make" else {})
+    for ego in ("idm", "ego.zip", "noisy:gail", "human:no-headway-rule", "process:imitation?timeout=3"):
+        assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == {}
+    for ego in ("evil:make", f"{'a' * 300}:make"):
+        assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == {"ego": ego}
 
 
 @pytest.mark.parametrize("name", ["vecnormalize.pkl", "mine.pkl"])
