@@ -55,18 +55,6 @@ def replace_file(path: str | Path) -> Iterator[Path]:
     _sync(path.parent)
 
 
-def refuse_folder(path: Path) -> None:
-    """Refuse to write a file where there is a folder; a link to one is none."""
-    if path.is_dir() and not path.is_symlink():
-        raise ValueError(f"Cannot write {str(path)!r}: there is a folder of that name.")
-
-
-def refuse_link(path: Path) -> None:
-    """Refuse a link in the place of a folder inside one of somebody else: what is written there would be elsewhere."""
-    if path.is_symlink():
-        raise ValueError(f"{str(path)!r} is a link, and nothing is written through one: remove it.")
-
-
 def replace_text(path: str | Path, text: str) -> None:
     """Write text in UTF-8 in place of what a file holds; see `replace_file`."""
     with replace_file(path) as draft:

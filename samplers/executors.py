@@ -29,10 +29,10 @@ from samplers.evaluate import Executor, Index, Pool, Result, Work, join_results
 from samplers.method import Request
 from samplers.problem import check_number, check_whole
 from samplers.workers import (
+    SAFE_PATH,
     ExecutorError,
     Reply,
     WorkerLost,
-    begin_as_ever,
     compute_in_worker,
     describe,
     describe_loss,
@@ -478,7 +478,7 @@ class _LocalProcess:
 
 def _begin_process(driver: int) -> None:
     """Let this process end with its driver, and lead a group, which Ctrl-C does not reach: the driver decides."""
-    begin_as_ever()
+    os.environ.pop(SAFE_PATH, None)
     end_with(driver)
     if hasattr(os, "setsid"):
         os.setsid()

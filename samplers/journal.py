@@ -210,8 +210,8 @@ class Journal:
         there = self._exists
         self._connection.close()
         if there:
-            self._absolute.unlink()
-            _wal(self._absolute).unlink(missing_ok=True)
+            for name in _list_files(self._absolute):
+                name.unlink(missing_ok=True)
 
     @property
     def _exists(self) -> bool:

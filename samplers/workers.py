@@ -19,8 +19,8 @@ from samplers.method import Request
 
 ENDED_ITSELF = "1"
 """Exit code of a process that `faulthandler.dump_traceback_later` has ended at the limit of time."""
-SAFE_PATH, OURS = "PYTHONSAFEPATH", "samplers"
-"""Variable of the environment by which Python leaves the working directory out, and its value where it is set here."""
+SAFE_PATH = "PYTHONSAFEPATH"
+"""Variable by which Python leaves the working directory out."""
 PARENT_SECONDS = 1.0
 """Time [s] between two looks of a worker whether its driver is still there."""
 
@@ -66,22 +66,17 @@ def name_process() -> tuple[str, int]:
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Let a Python that is started meanwhile not look for modules in the working directory (from 3.11 on).
+    """Let a Python that is started meanwhile not look for modules in the working directory first (from 3.11 on).
 
-    It would do so before it looks anywhere else, and the folder may be somebody else's; see `begin_as_ever`.
+    The folder may be somebody else's. The process is to remove the variable: what an ego starts finds its own as ever.
     """
-    mine = os.environ.setdefault(SAFE_PATH, OURS) == OURS
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = before or "1"
     try:
         yield
     finally:
-        if mine:
-            os.environ.pop(SAFE_PATH, None)
-
-
-def begin_as_ever() -> None:
-    """Let what this process starts find its modules as ever: what an ego starts, say."""
-    if os.environ.get(SAFE_PATH) == OURS:
-        del os.environ[SAFE_PATH]
+        if not before:
+            del os.environ[SAFE_PATH]
 
 
 def compute_in_worker(

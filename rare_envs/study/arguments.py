@@ -19,7 +19,7 @@ from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from rare_envs.files import read_text_file, refuse_folder, refuse_link
+from rare_envs.files import read_text_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.registry import find_scenario, split_layout
 
@@ -97,16 +97,16 @@ def as_bad_input(*kinds: type[BaseException]) -> Iterator[None]:
 def output_folder(path: Path, *files: str, folders: Iterable[str] = ()) -> Iterator[None]:
     """Make the folder for results, and folders in it, before the work, so that no run ends without a place to write to.
 
-    Folders in the way of its files are refused, and links in the place of those folders.
+    Folders in the way of its files are refused, and links in the place of those folders, which may lead out of it.
     """
     inside = [path / name for name in folders]
     new = [folder for folder in (*inside, path, *path.parents) if not os.path.exists(folder)]
     try:
-        with as_bad_input(ValueError):
-            for folder in inside:
-                refuse_link(folder)
-            for file in files:
-                refuse_folder(path / file)
+        for link in filter(Path.is_symlink, inside):
+            raise BadInput(f"{str(link)!r} is a link, and nothing is written through one: remove it.")
+        for folder in filter(Path.is_dir, (path / file for file in files)):
+            if not folder.is_symlink():  # which is replaced
+                raise BadInput(f"Cannot write {str(folder)!r}: there is a folder of that name.")
         for folder in (path, *inside):
             try:
                 folder.mkdir(parents=True, exist_ok=True)

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
-from rare_envs.files import refuse_link
-from rare_envs.study.arguments import BadInput, as_bad_input, output_file
+from rare_envs.study.arguments import BadInput, as_bad_input, output_file, output_folder
 from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, RunArgument, command
 
 if TYPE_CHECKING:
@@ -55,10 +54,9 @@ def corpus_add_command(
     """Add the failures of a run to a corpus, a file each, named by what is in it."""
     from rare_envs.study.corpus import add_run
 
-    if "corpus" not in typed:  # the working directory may be somebody else's
-        with as_bad_input(ValueError):
-            refuse_link(corpus)
-    chosen, new = add_run(run, corpus, most, **asked)
+    # the working directory may be somebody else's
+    with output_folder(corpus.parent, folders=() if "corpus" in typed else (corpus.name,)):
+        chosen, new = add_run(run, corpus, most, **asked)
     text = f"Added {new} of {len(chosen)} failures to {corpus}{'' if new else '; it had all of them'}."
     return Answer({"corpus": str(corpus), "added": new, "failures": [each.key for each in chosen]}, text)
 

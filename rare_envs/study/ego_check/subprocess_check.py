@@ -33,7 +33,7 @@ from rare_envs.study.arguments import BadInput, Question, as_bad_input
 from rare_envs.study.ego_check import Finding
 from rare_envs.study.ego_check.checks import EGO_CHECKS, Probe
 from rare_envs.study.question import build_problem
-from samplers.workers import begin_as_ever, starting_processes
+from samplers.workers import SAFE_PATH, starting_processes
 
 START_TIMEOUT, COMPILING_TIMEOUT = 60.0, 600.0
 """Durations that the process may take before its first check, and for compiling rollouts [s]."""
@@ -99,7 +99,7 @@ def _check_in_subprocess(question: Question, time_limit: float) -> Iterator[Find
 
 def _send_findings(question: Question, to: Connection) -> None:
     """Run the checks in that process: send each finding, before each check its name, and None at the end."""
-    begin_as_ever()
+    os.environ.pop(SAFE_PATH, None)
     os.dup2(2, 1)  # an ego may print
     with use_one_thread():
         for each in run_checks(question):
