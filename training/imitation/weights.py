@@ -122,6 +122,8 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
     driver = read_driver(folder / DRIVER)
     own = head_weights(driver.policy).double().numpy()
     kept = folder / f"members-{ensemble.updates}-{ensemble.seed}"
+    if kept.is_symlink():
+        raise ValueError(f"{str(kept)!r} is a link, and nothing is written through one: remove it.")
     kept.mkdir(exist_ok=True)
     data = prepare_data(load_scenes(source)[0])
     members = []
