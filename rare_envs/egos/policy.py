@@ -243,7 +243,7 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
     if action != "continuous":
         names = ", ".join(META_ACTIONS) if action == "meta" else "five accelerations"
         wanted = (
-            f"Discrete({len(DISCRETE_ACTIONS)}) ({names}); leave action={action!r} out for an ego that accelerates and "
-            "steers."
+            f"Discrete({len(DISCRETE_ACTIONS)}) ({names}); take action='continuous' (--action continuous) for an ego "
+            "that accelerates and steers."
         )
     raise ValueError(f"The ego acts in {acted}, the environment takes {wanted}")

@@ -73,6 +73,8 @@ def test_wrong_environments_and_settings_are_refused() -> None:
         make_highway_env("highway-fst-v0", None)
 
 
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
+@pytest.mark.filterwarnings("ignore:.*A Box observation space .*imum value is -?infinity")
 def test_gymnasiums_checker_takes_it_and_makes_it_again() -> None:
     env = scenario("highway-fast-v0", vehicles=2)
     check_env(env, skip_render_check=True)
