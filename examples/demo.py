@@ -57,7 +57,7 @@ def demo(steps: int, out: Path) -> None:
     torch.set_num_threads(1)  # batches this small are slower on more
     environments = tuple(map(env_id_of, SCENARIO_SET))
     print(f"1. Training a PPO ego in {' and '.join(environments)} for {steps:,} steps.", flush=True)
-    ego = train_ego(environments, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
+    ego = train_ego(environments, algo="ppo", steps=steps, seed=0, out=out / "ego.zip", force=True)
 
     print("2. Estimating how often it collides: find failures, then estimate from draws made for them.", flush=True)
     found = risk(str(ego), out=out, seed=0, trust=True, progress=True, force=True)  # it has just been written

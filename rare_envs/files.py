@@ -142,8 +142,9 @@ def open_parquet(path: str | Path) -> Iterator[pyarrow.parquet.ParquetFile]:
             file.seek(max(0, os.fstat(file.fileno()).st_size - 8))
             if int.from_bytes(file.read(4), "little") > MAX_FOOTER_BYTES:
                 raise ValueError("its end, which describes it, is too large.")
-        with pyarrow.parquet.ParquetFile(path) as table:
-            yield table
+            file.seek(0)
+            with pyarrow.parquet.ParquetFile(file) as table:  # Arrow itself opens names in UTF-8 only
+                yield table
     except (OSError, ValueError) as error:
         raise ValueError(f"Cannot read {str(path)!r}: {' '.join(str(error).split())}") from error
 

@@ -75,7 +75,7 @@ def estimate(
     time_limit: float | None = None,
     stop: Callable[[Progress], bool] | None = None,
     ensemble_run: bool = True,
-    journal: str | os.PathLike[str] | None = None,
+    journal: str | os.PathLike[str] | Journal | None = None,
     workers: int | None = None,
     executor: AnyExecutor | None = None,
     keep_points: bool = False,
@@ -166,10 +166,12 @@ def estimate(
 
 
 @contextmanager
-def _open_journal(path: str | os.PathLike[str] | None, problem: Inputs, seed: int | None) -> Iterator[Journal | None]:
-    """Yield the journal at a path, begun or continued, and close it; None for no path."""
-    if path is None:
-        yield None
+def _open_journal(
+    path: str | os.PathLike[str] | Journal | None, problem: Inputs, seed: int | None
+) -> Iterator[Journal | None]:
+    """Yield the journal at a path, begun or continued, and close it; None for no path, and an open one as it is."""
+    if path is None or isinstance(path, Journal):
+        yield path
         return
     file, begun = Path(path), {"dim": int(problem.dim), "seed": choose_seed(seed)}
     try:
@@ -338,8 +340,8 @@ def show_bar(max_sim: int | None) -> Iterator[Listener]:
 
 
 @contextmanager
-def defer_signals() -> Iterator[None]:
-    """Let SIGINT, SIGTERM and SIGHUP wait for the end of the block; the second one does not wait.
+def defer_signals() -> Iterator[list[int]]:
+    """Let SIGINT, SIGTERM and SIGHUP wait for the end of the block, which gets their list; the second does not wait.
 
     Only those with a handler in Python, and in the main thread, as others do not interrupt Python code.
     """
@@ -358,7 +360,7 @@ def defer_signals() -> Iterator[None]:
                 handlers[number] = handler
                 signal.signal(number, note)
     try:
-        yield
+        yield received
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)

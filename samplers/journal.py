@@ -194,10 +194,10 @@ class Journal:
         self._waiting.append(_Row(-1, points, table.shape[1], n_sim, seconds, text, numbers))
         self._write_waiting()
 
-    def flush(self) -> bool:
-        """Write what is left, and return whether all simulations so far are in a file that is still there."""
+    def flush(self) -> int:
+        """Write what is left, and return how many simulations are in the file, if it is still there."""
         self._write_waiting()
-        return not self._waiting and self._exists
+        return self.n if self._exists else 0
 
     def close(self) -> None:
         """Leave the journal for later."""
@@ -248,7 +248,7 @@ class Journal:
 
 def _connect(path: Path) -> sqlite3.Connection:
     """Return a connection to a file that nobody else has; raise a JournalError for one in use and for no journal."""
-    uri = f"file:{quote(str(path.absolute()))}?mode=rw"
+    uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
     connection = sqlite3.connect(uri, uri=True, timeout=0.0, isolation_level=None)
     try:
         for statement in ("locking_mode = EXCLUSIVE", "trusted_schema = OFF", "journal_mode = WAL"):

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from rare_envs.files import open_ordinary, replace_file
+from rare_envs.plugins import one_line
 
 CHECKPOINT_FORMAT = 3
 """Version of the file."""
@@ -25,10 +26,17 @@ COUNTERS = "num_timesteps _n_updates _episode_num _n_calls exploration_rate _cur
 """Attributes of a model that count, where its algorithm has them."""
 
 
+class TrainingInterrupted(KeyboardInterrupt):
+    """A training was interrupted; the message says what is kept and how to go on."""
+
+
 def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
-    """Write the state of a training; an interruption leaves the file of before."""
-    with replace_file(path) as draft:
-        torch.save(state, draft)
+    """Write the state of a training; an interruption or an OSError leaves the file of before."""
+    try:
+        with replace_file(path) as draft:
+            torch.save(state, draft)
+    except RuntimeError as error:  # torch's word for a full disk
+        raise OSError(f"Cannot write {str(path)!r}: {one_line(error)}") from error
 
 
 def read_checkpoint(path: Path, entries: Sequence[str], device: torch.device | str = "cpu") -> dict[str, Any]:

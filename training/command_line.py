@@ -69,12 +69,15 @@ class DriverTrainingOptions:
 
 @contextlib.contextmanager
 def report_errors(program: str) -> Iterator[None]:
-    """Print an error of the arguments or of a file in one line with the program's name, and exit with code 2."""
+    """Print an error of the arguments or of a file in one line with the program's name, and exit with code 2.
+
+    An interruption is a line too, and code 130.
+    """
     try:
         yield
-    except (OSError, ValueError) as error:
-        typer.echo(f"{program}: {error}", err=True)
-        raise typer.Exit(2) from None
+    except (OSError, ValueError, KeyboardInterrupt) as error:
+        typer.echo(f"{program}: {error or 'stopped'}", err=True)
+        raise typer.Exit(130 if isinstance(error, KeyboardInterrupt) else 2) from None
 
 
 def run_command(command: Callable[..., None]) -> None:

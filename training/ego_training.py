@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import math
 import os
 import time
+import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,8 +22,8 @@ from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.startup import use_one_thread
-from samplers.estimation import NARROW_TERMINAL
-from training.checkpoints import load_checkpoint, restore_model, save_checkpoint
+from samplers.estimation import NARROW_TERMINAL, defer_signals
+from training.checkpoints import TrainingInterrupted, load_checkpoint, restore_model, save_checkpoint
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -133,6 +135,7 @@ def train_ego(
     out: str | Path = Path("ego.zip"),
     progress: bool = True,
     resume: bool = False,
+    force: bool = False,
     checkpoint_interval: float = CHECKPOINT_SECONDS,
     retraining: Retraining | None = None,
     even_strata: bool = True,
@@ -151,6 +154,7 @@ def train_ego(
         out: The `.zip` to write; missing folders are made, a missing suffix is added.
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
+        force: Replace an ego that is in `out`, or an unfinished training beside it.
         checkpoint_interval: Time between checkpoints [s]; the last one is removed when the ego is saved.
         retraining: An ego to go on from, in place of a new one, and failures of the one environment, which are mixed
             into the scenarios.
@@ -163,9 +167,10 @@ def train_ego(
         Path of the `.zip`, which `agents.load_ego` and Stable-Baselines3 read.
 
     Raises:
-        ValueError: An argument is not usable, there is an unfinished training beside `out` and it is not to be
-            resumed, or there is none to resume; nothing has been simulated then.
-        OSError: The ego or a checkpoint cannot be written; what was in the file before stays.
+        ValueError: An argument is not usable, there is an ego in `out` or an unfinished training beside it and neither
+            is to be replaced, or there is none to resume; nothing has been simulated then.
+        OSError: The ego cannot be written; what was in the file before stays, and the checkpoint has the training.
+        TrainingInterrupted: After a signal, which waits for the end of a rollout; the checkpoint has the training.
 
     Example:
         >>> import tempfile
@@ -196,8 +201,12 @@ def train_ego(
     arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
     arguments |= {} if retraining is None else retraining.arguments()
     checkpoint = target.with_suffix(CHECKPOINT_SUFFIX)
-    if checkpoint.exists() and not resume:
-        raise ValueError(f"There is an unfinished training in {str(checkpoint)!r}: go on with --resume, or remove it.")
+    if target.exists() and not force:
+        raise ValueError(f"There is {str(target)!r} already: choose another file, or replace it by --force.")
+    if checkpoint.exists() and not (resume or force):
+        raise ValueError(
+            f"There is an unfinished training in {str(checkpoint)!r}: go on with --resume, or replace it by --force."
+        )
     if resume and not checkpoint.exists():
         raise ValueError(f"There is no training to resume: no {str(checkpoint)!r}.")
     saved = load_checkpoint(checkpoint, arguments) if resume else None
@@ -206,8 +215,9 @@ def train_ego(
 
     hyperparameters = HYPERPARAMETERS[algo]
     env = sb3_vec_env(ids, num_envs, discrete=hyperparameters.discrete, even_strata=even_strata, **make_kwargs)
+    told = "Stopped at once: of the last steps nothing is kept."
     try:
-        with use_one_thread(), _progress_bar(progress) as bar:
+        with use_one_thread(), _progress_bar(progress) as bar, defer_signals() as received:
             settings = _fit_to_run(hyperparameters, num_envs, steps)
             if retraining is None:
                 model = _make_model(algo, env, seed, settings, hyperparameters.policy, device)
@@ -216,14 +226,29 @@ def train_ego(
             if saved is not None:
                 model.get_env().reset()
                 restore_model(model, saved)
-            callback = _make_callback(bar, steps, checkpoint, arguments, checkpoint_interval)
+            callback = _make_callback(bar, steps, checkpoint, arguments, checkpoint_interval, received)
             model.learn(steps - model.num_timesteps, callback=callback, reset_num_timesteps=saved is None)
-        with replace_file(target) as draft:
-            model.save(draft)
-        checkpoint.unlink(missing_ok=True)
+            told = callback.kept
+            if not told:
+                _save_ego(model, target, callback)
+                checkpoint.unlink(missing_ok=True)
+    except KeyboardInterrupt:
+        if told:
+            raise TrainingInterrupted(told) from None
     finally:
         env.close()
     return target
+
+
+def _save_ego(model: Any, target: Path, callback: Any) -> None:
+    """Write a trained ego; where that fails, a checkpoint keeps the training and the OSError says so."""
+    content = io.BytesIO()
+    model.save(content)
+    try:
+        with replace_file(target) as draft:
+            draft.write_bytes(content.getvalue())
+    except OSError as error:
+        raise OSError(f"Cannot write {str(target)!r}: {error.strerror or error}. {callback.keep()}") from error
 
 
 def _make_model(
@@ -344,19 +369,38 @@ def _progress_bar(show: bool) -> Progress:
     return Progress(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console, disable=not show)
 
 
-def _make_callback(bar: Progress, steps: int, path: Path, arguments: Mapping[str, Any], interval: float) -> Any:
-    """Return the callback that advances the bar, and writes a checkpoint where a rollout begins, after an interval."""
+def _make_callback(
+    bar: Progress, steps: int, path: Path, arguments: Mapping[str, Any], interval: float, received: Sequence[int]
+) -> Any:
+    """Return the callback that advances the bar, and writes a checkpoint where a rollout begins.
+
+    It does so after an interval, and when a signal was received, which ends the training.
+    """
     from stable_baselines3.common.callbacks import BaseCallback
 
     task, crashes = bar.add_task("", total=steps), deque[bool](maxlen=RECENT)
 
     class Callback(BaseCallback):
-        written = time.monotonic()
+        written, kept = time.monotonic(), ""
+
+        def keep(self) -> str:
+            """Write a checkpoint, if there is room, and return what to say of it."""
+            try:
+                save_checkpoint(path, arguments, self.model)
+            except OSError as error:
+                why = error.strerror or error
+                warnings.warn(f"Cannot write {str(path)!r}: {why}; what is trained is not kept.", stacklevel=2)
+                return "The last steps are not kept."
+            finally:
+                self.written = time.monotonic()
+            n = self.model.num_timesteps
+            return f"{n:,} of {steps:,} steps are kept in {str(path)!r}: go on by the same command with --resume."
 
         def _on_rollout_start(self) -> None:
-            if time.monotonic() - self.written >= interval:
-                save_checkpoint(path, arguments, self.model)
-                self.written = time.monotonic()
+            if received:
+                self.kept = f"Stopped: {self.keep()}"
+            elif time.monotonic() - self.written >= interval:
+                self.keep()
 
         def _on_step(self) -> bool:
             if not bar.disable:
@@ -367,6 +411,6 @@ def _make_callback(bar: Progress, steps: int, path: Path, arguments: Mapping[str
                 if crashes:
                     words.append(f"collisions {100 * sum(crashes) / len(crashes):.1f} %")
                 bar.update(task, completed=min(self.model.num_timesteps, steps), description=", ".join(words))
-            return True
+            return not self.kept
 
     return Callback()

@@ -123,9 +123,17 @@ def output_folder(path: Path, *files: str, folders: Iterable[str] = ()) -> Itera
         raise
 
 
+def refuse_existing(force: bool, *paths: Path | None) -> None:
+    """Raise a BadInput if something of these names is there already and is not to be replaced."""
+    for path in paths:
+        if path is not None and not force and os.path.lexists(path):
+            raise BadInput(f"There is {str(path)!r} already: choose another name, or replace it by --force.")
+
+
 @contextlib.contextmanager
-def output_file(path: Path | None) -> Iterator[None]:
+def output_file(path: Path | None, force: bool = True) -> Iterator[None]:
     """Make the folder of a file before the work, as `output_folder` does; None where there is none to write."""
+    refuse_existing(force, path)
     with contextlib.nullcontext() if path is None else output_folder(path.parent, path.name):
         yield
 

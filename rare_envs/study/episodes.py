@@ -146,7 +146,8 @@ class EpisodeTable:
             self._folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
             with (
                 replace_file(self._folder / EPISODES) as path,
-                pq.ParquetWriter(path, schema, compression="zstd") as file,
+                path.open("wb") as opened,  # Arrow takes names in UTF-8 only
+                pq.ParquetWriter(opened, schema, compression="zstd") as file,
                 pa.ipc.open_stream(self._file) as draft,
             ):
                 first = 0

@@ -327,7 +327,7 @@ def run_into(
     """
     study = settle_chunk(study, executor)
     part = part and not study.ego_was_given
-    begin = partial(writing.begin_journal, folder, study.question, force, go_on=part)
+    begin = partial(writing.begin_journal, folder, study.question, force, part_of="risk" if part else "")
     with output_folder(folder, *RESULT_FILES), contextlib.closing(begin()) as journal:
         if journal.has_simulations:
             writing.note_resumption(folder, journal.earlier_seconds)
@@ -349,6 +349,8 @@ def resume(
     """Continue an interrupted run; the answer is that of an undisturbed one."""
     journal, question = writing.continue_journal(folder, mend)
     with contextlib.closing(journal), output_folder(folder, *RESULT_FILES):
+        if (part_of := journal.head.get("part_of")) not in ("", "risk"):
+            raise BadInput(f"{str(folder)!r} is of rare-envs {part_of}, which goes on with {writing.SAME_AGAIN}")
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         given = {name: value for name, value in (("ego", ego), ("on_error", on_error)) if value}
@@ -365,7 +367,7 @@ def resume(
             study = replace(study, question=replace(question, chunk=study.problem.tile))
         writing.note_resumption(folder, journal.earlier_seconds)
         with _keeping(folder, study, journal) as target:
-            return _finish(target, run(study, progress, journal, executor, target), journal)
+            return _finish(target, run(study, progress, journal, executor, target), journal, keep=bool(part_of))
 
 
 def _finish(target: Path, report: Report, journal: Journal, keep: bool = False) -> Report:
@@ -374,6 +376,8 @@ def _finish(target: Path, report: Report, journal: Journal, keep: bool = False) 
     report = replace(report, seconds=report.seconds + earlier, earlier_seconds=earlier)
     with arguments.keep_answer(report):
         writing.finish_run(target, report)
+    if report.lost:
+        raise UnwrittenResults(f"{report.lost}.", report)
     if not keep:
         journal.remove()
     return report
@@ -385,16 +389,17 @@ def _keeping(folder: Path, study: Study, journal: Journal, part: bool = False) -
     target = folder.absolute()
 
     def kept(report: Report | None = None) -> str:
-        if not journal.has_simulations or not journal.flush():
+        n_kept = journal.flush()
+        if not n_kept:
             return ""
-        count = f"{journal.n:,} simulations"
+        count = f"{n_kept:,} simulations"
         if report is not None and report.estimate.status is not samplers.Status.STOPPED:
             n, further = report.estimate.n_sim, report.estimate.ensemble_run
-            n_further = journal.n - n if further is None else further.n_sim
+            n_further = n_kept - n if further is None else min(further.n_sim, n_kept - n)
             if n_further > 0:
                 count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
         again = f"rare-envs resume {shlex.quote(str(folder))}{' --trust' if study.question.trust else ''}"
-        return f" {count} are kept; go on with: {'the same command again.' if part else again}"
+        return f" {count} are kept; go on with: {writing.SAME_AGAIN if part else again}"
 
     try:
         yield target
@@ -431,11 +436,15 @@ def compare_egos(
             "random has its own in x: estimate each by itself."
         )
     kept = {name: RowKeeper(question.gamma) for name in studies}
-    evaluators = {name: Evaluator(each.problem, question.gamma, name="The ego") for name, each in studies.items()}
-    for name, evaluator in evaluators.items():
-        evaluator.watchers.append(kept[name].keep)
     asked: dict[str, Any] = {name: getattr(question, name) for name in ("gamma", "seed", "max_sim", "ensemble_run")}
-    with contextlib.nullcontext() if out is None else output_folder(out, COMPARISON, FAILURES, BLOCKS):
+    questions = {name: study.question for name, study in studies.items()}
+    with writing.journals_of("compare", out, questions, force, COMPARISON, FAILURES, BLOCKS) as journals:
+        evaluators = {
+            name: Evaluator(each.problem, question.gamma, journal=journal, name="The ego")
+            for (name, each), journal in zip(studies.items(), journals, strict=True)
+        }
+        for name, evaluator in evaluators.items():
+            evaluator.watchers.append(kept[name].keep)
         try:
             with as_bad_input(ValueError, EgoGone):
                 method = studies["A"].method
@@ -455,8 +464,9 @@ def compare_egos(
             "version": __version__,
         }
         if out is not None:
-            replace_text(out / COMPARISON, format_json(answer) + "\n")
-            writing.write_failures(out, studies["A"].problem.space, found.either.failures)
+            with writing.unwritten_results(out, (found, answer)):
+                replace_text(out / COMPARISON, format_json(answer) + "\n")
+                writing.write_failures(out, studies["A"].problem.space, found.either.failures)
     return found, answer
 
 

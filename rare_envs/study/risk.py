@@ -31,7 +31,7 @@ from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, build_problem, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL
-from rare_envs.study.writing import check_no_results
+from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
@@ -314,14 +314,17 @@ def risk(
         for study in studies:
             find_frequency(study)
     with contextlib.nullcontext() if folder is None else output_folder(folder, RISK, PICTURE, folders=fitting):
-        if folder is not None and not force:  # all of them, before the first one is run
+        if folder is not None and force:
+            (folder / RISK).unlink(missing_ok=True)
+            clear_runs({folder / name: study.question for name, study in zip(fitting, studies, strict=True)})
+        elif folder is not None:  # all of them, before the first one is run
             check_no_results(folder, RISK)
             for part in (folder / name for name in fitting if not (folder / name / JOURNAL).exists()):
                 check_no_results(part)
         done: list[ScenarioRisk] = []
         for study in studies:
             try:
-                done.append(_evaluate(study, sites[1:], folder, progress, force))
+                done.append(_evaluate(study, sites[1:], folder, progress))
             except RunInterrupted as error:
                 known = "; ".join(
                     f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done
@@ -329,8 +332,9 @@ def risk(
                 raise RunInterrupted(f"{error}{f' Done before: {known}.' if done else ''}", error.report) from None
         found = Risk(ego=ego_name, scenarios=tuple(done), left_out=left_out)
         if folder is not None:
-            found.save_plot(folder / PICTURE)
-            replace_text(folder / RISK, format_json(found.to_dict()) + "\n")
+            with unwritten_results(folder, found):
+                found.save_plot(folder / PICTURE)
+                replace_text(folder / RISK, format_json(found.to_dict()) + "\n")
             for name in fitting:
                 (folder / name / JOURNAL).unlink(missing_ok=True)
     return found
@@ -375,12 +379,10 @@ def _find_misfits(questions: Mapping[str, Question], ego: Any) -> dict[str, str]
     return found
 
 
-def _evaluate(
-    study: Study, other_sites: Sequence[str], folder: Path | None, progress: bool, force: bool
-) -> ScenarioRisk:
+def _evaluate(study: Study, other_sites: Sequence[str], folder: Path | None, progress: bool) -> ScenarioRisk:
     """Run one scenario and return its rate, with the spread between sites if there are others."""
     name = study.problem.world.scenario.name
-    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, force, part=True)
+    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, part=True)
     assert report.rate is not None  # `risk` has looked for the frequency before
     with keep_answer(report):
         factors = compare_sites(report, other_sites, progress)

@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.files import digest_file, open_parquet, parse_json_object, read_members, read_rows, read_text_file
+from rare_envs.files import (
+    digest_file,
+    open_ordinary,
+    open_parquet,
+    parse_json_object,
+    read_members,
+    read_rows,
+    read_text_file,
+)
 from rare_envs.plugins import one_line
 from rare_envs.study.arguments import BadInput, as_bad_input
 
@@ -180,7 +188,8 @@ class LoadedStudy:
         where = None if failed is None else [("failed", "=", failed)]
         with open_parquet(path) as file:
             _check_size(path, file, columns or known)
-            return pq.read_table(path, columns=columns, filters=where)
+            with open_ordinary(path) as opened:
+                return pq.read_table(opened, columns=columns, filters=where)
 
 
 def _check_size(path: Path, file: pyarrow.parquet.ParquetFile, columns: list[str]) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
 import platform
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime, timezone
 from importlib import metadata
@@ -25,7 +25,7 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import digest_file, format_json, replace_file, replace_text
 from rare_envs.startup import __version__
 from rare_envs.study import run_folder
-from rare_envs.study.arguments import BadInput, Question, UnwrittenResults, read_question
+from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, output_folder, read_question
 from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import save_plot, saved_figure
 from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question, note_question, read_about
@@ -36,19 +36,22 @@ from samplers.result import method_settings
 
 BEGIN_AGAIN = "give the command again."
 """Advice where there is nothing to continue."""
+SAME_AGAIN = "the same command again, without --force."
+"""How goes on what is no single estimate."""
 
 
-def begin_journal(folder: Path, question: Question, force: bool = False, go_on: bool = False) -> Journal:
-    """Return the journal of a new run; `force` replaces that of an unfinished one, `go_on` continues it."""
+def begin_journal(folder: Path, question: Question, force: bool = False, part_of: str = "") -> Journal:
+    """Return the journal of a new run; `force` replaces that of an unfinished one, a part of a command continues it."""
     if not force and not (folder / run_folder.JOURNAL).exists():
         check_no_results(folder)
-    head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
+    head: dict[str, Any] = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
+    head |= {"seed": question.seed, "part_of": part_of}
     try:
         return Journal.create(folder / run_folder.JOURNAL, head, replace=force)
     except JournalError as error:
         if "already" not in str(error):
             raise BadInput(error) from error
-        if go_on:
+        if part_of:
             return _continue_same(folder, head)
         raise BadInput(
             f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume "
@@ -76,6 +79,8 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
         why = f"it has no {run_folder.JOURNAL}. Of one that was {begun}, {BEGIN_AGAIN}"
         if (folder / run_folder.RESULT).is_file():
             why = f"it has a finished one ({run_folder.RESULT})."
+        elif next(folder.glob(f"*/{run_folder.JOURNAL}"), None):
+            why = f"its parts go on with {SAME_AGAIN}"
         elif not folder.is_dir():
             why = f"the folder does not exist. Of a run that was {begun}, {BEGIN_AGAIN}"
         raise BadInput(f"There is no unfinished run in {str(folder)!r}: {why}") from error
@@ -101,6 +106,52 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
         raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
 
 
+@contextlib.contextmanager
+def journals_of(
+    command: str, out: Path | None, questions: Mapping[str, Question], force: bool, *results: str
+) -> Iterator[Sequence[Journal | None]]:
+    """Yield the journals of the parts of a command, each in a folder in `out`; what stops it says what they keep.
+
+    Where it begins by `force`, the parts and the results of an earlier one are removed. None without `out`.
+    """
+    with contextlib.ExitStack() as stack:
+        if out is None:
+            yield [None for _ in questions]
+            return
+        stack.enter_context(output_folder(out, *results))
+        parts, journals = {out / name: question for name, question in questions.items()}, list[Journal]()
+        if force:
+            clear_runs(parts)
+            for name in results:
+                (out / name).unlink(missing_ok=True)
+        for folder, question in parts.items():
+            stack.enter_context(output_folder(folder))
+            journal = begin_journal(folder, question, part_of=command)
+            journals.append(stack.enter_context(contextlib.closing(journal)))
+        try:
+            yield journals
+        except (BadInput, KeyboardInterrupt) as error:
+            if not (kept := sum(journal.flush() for journal in journals)):
+                for journal in journals:
+                    journal.remove()
+                raise
+            again = f"{error} {kept:,} simulations are kept; go on with: {SAME_AGAIN}"
+            kind = RunInterrupted if isinstance(error, KeyboardInterrupt) else UnwrittenResults
+            raise kind(again, getattr(error, "report", None)) from error
+        for folder, journal in zip(parts, journals, strict=True):
+            journal.remove()
+            with contextlib.suppress(OSError):  # it has results
+                folder.rmdir()
+
+
+def clear_runs(parts: Mapping[Path, Question]) -> None:
+    """Remove earlier runs from the folders of parts of a command, so that the new ones can be stopped and go on."""
+    for folder, question in parts.items():
+        if (folder / run_folder.JOURNAL).exists():
+            begin_journal(folder, question, force=True).remove()
+        _remove_results(folder)
+
+
 def check_no_results(folder: Path, *names: str) -> None:
     """Raise a BadInput if a folder has results of a finished run, or files of these names."""
     for name in (run_folder.RESULT, run_folder.FAILURES, *names):
@@ -108,11 +159,18 @@ def check_no_results(folder: Path, *names: str) -> None:
             raise BadInput(f"There is a finished run in {str(folder)!r} ({name}): replace it by --force.")
 
 
+def _remove_results(folder: Path) -> None:
+    """Remove the results of an earlier run."""
+    for name in run_folder.RESULT_FILES:
+        (folder / name).unlink(missing_ok=True)
+    _remove_drafts(folder)
+
+
 def _remove_drafts(folder: Path) -> None:
     """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
     for name in map(Path, run_folder.RESULT_FILES):
         for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
-            with suppress(OSError):  # a folder of that name is none
+            with contextlib.suppress(OSError):  # a folder of that name is none
                 draft.unlink()
 
 
@@ -199,9 +257,7 @@ LIBRARIES = "cvxpy gymnasium highway-env numba numpy onnxruntime scikit-learn sc
 
 def begin_study_file(folder: Path, study: Study) -> None:
     """Write study.json of a run that begins, in place of the files of an earlier one, and note that it was asked."""
-    for name in run_folder.RESULT_FILES:
-        (folder / name).unlink(missing_ok=True)
-    _remove_drafts(folder)
+    _remove_results(folder)
     _write_study_file(folder, describe_study(study))
     note_question(study.question)
 
@@ -210,13 +266,13 @@ def note_resumption(folder: Path, earlier_seconds: float) -> None:
     """Note in study.json that an interrupted run of so many seconds goes on; one that cannot be read is left."""
     _remove_drafts(folder)
     if "question" in (about := read_about(folder)):
-        with suppress(OSError):  # a full disk is found when results are written
+        with contextlib.suppress(OSError):  # a full disk is found when results are written
             _write_study_file(folder, about | {"resumed": _now(), "earlier_seconds": earlier_seconds})
 
 
 def finish_run(folder: Path, report: Report) -> None:
     """Write the results, and note in study.json that the run is done; a folder that somebody removed is made again."""
-    try:
+    with unwritten_results(folder, report):
         folder.mkdir(parents=True, exist_ok=True)
         write_run(folder, report)
         begun = read_about(folder)  # stays, but for what somebody has put there: of another question, or of none
@@ -225,6 +281,13 @@ def finish_run(folder: Path, report: Report) -> None:
         digests = {name: digest_file(folder / name) for name in run_folder.DIGESTED if (folder / name).is_file()}
         ended = {"finished": _now(), "seconds": report.seconds, "results": digests}
         _write_study_file(folder, {**begun, **ended})
+
+
+@contextlib.contextmanager
+def unwritten_results(folder: Path, report: Any) -> Iterator[None]:
+    """Raise an OSError as UnwrittenResults, with the answer."""
+    try:
+        yield
     except OSError as error:
         raise UnwrittenResults(
             f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report
@@ -239,7 +302,7 @@ def describe_study(study: Study) -> dict[str, Any]:
     rests_on = "".join(sorted(ego_files.values())) or f"{question.ego} of rare-envs {__version__}"
     versions = {"rare-envs": __version__, "python": platform.python_version()}
     for name in LIBRARIES:
-        with suppress(metadata.PackageNotFoundError):
+        with contextlib.suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
     program = Path(sys.argv[0] if sys.argv else "")
     ours = program.stem == "rare-envs" or program.parts[-2:] == ("rare_envs", "__main__.py")

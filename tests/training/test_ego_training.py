@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import stable_baselines3
 import torch
 from gymnasium import spaces
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import agents
@@ -31,7 +32,7 @@ from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.startup import use_one_thread
 from training import sb3_vec_env, train_ego
-from training.checkpoints import load_checkpoint
+from training.checkpoints import TrainingInterrupted, load_checkpoint
 from training.ego_training import Retraining, check_retrainable, restore_parameters
 
 ENV = "rare_envs/CutIn-v0"
@@ -97,40 +98,37 @@ def test_bad_requests_are_refused_before_work(tmp_path: Path, monkeypatch: pytes
         assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-class Stopped(Exception):
-    """Stands for whatever ends a training."""
+def stop_after(monkeypatch: pytest.MonkeyPatch, algo: str, count: int) -> None:
+    """Let Ctrl-C come after so many calls of an algorithm's `train`."""
+    algorithm, made = getattr(stable_baselines3, algo.upper()), [0]
+    train = algorithm.train
 
+    def train_and_stop(*arguments: Any, **more: Any) -> None:
+        train(*arguments, **more)
+        made[0] += 1
+        if made[0] == count:
+            signal.raise_signal(signal.SIGINT)
 
-def stop_after(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """Let the writing of checkpoint `count` be the last thing that a training does."""
-    written, save = [0], training.ego_training.save_checkpoint
-
-    def save_and_stop(*arguments: Any) -> None:
-        save(*arguments)
-        written[0] += 1
-        if written[0] == count:
-            raise Stopped
-
-    monkeypatch.setattr(training.ego_training, "save_checkpoint", save_and_stop)
+    monkeypatch.setattr(algorithm, "train", train_and_stop)
 
 
 @pytest.mark.parametrize(
-    ("algo", "steps", "checkpoint"),
+    ("algo", "steps", "trained"),
     [
-        ("ppo", 480, 2),
-        *(pytest.param(algo, 160, 11, marks=pytest.mark.slow) for algo in ("sac", "td3", "dqn")),
+        ("ppo", 480, 1),
+        *(pytest.param(algo, 160, 5, marks=pytest.mark.slow) for algo in ("sac", "td3", "dqn")),
     ],
 )
 def test_a_resumed_training_ends_alike(
-    algo: str, steps: int, checkpoint: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algo: str, steps: int, trained: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped half-way, with updates, and new scenarios for episodes that ended (after 0.8 s), before and after."""
     ids = ("rare_envs/HardBrake-v0", ENV) if algo == "ppo" else ENV
     common: dict[str, Any] = {"algo": algo, "steps": steps, "num_envs": ROWS, "progress": False, "horizon": 0.8}
     whole = train_ego(ids, out=tmp_path / "whole.zip", **common)
-    stop_after(monkeypatch, checkpoint)
-    with pytest.raises(Stopped):
-        train_ego(ids, out=tmp_path / "ego.zip", checkpoint_interval=0.0, **common)
+    stop_after(monkeypatch, algo, trained)
+    with pytest.raises(TrainingInterrupted, match=r"^Stopped: \d+ of \d+ steps are kept .* with --resume\.$"):
+        train_ego(ids, out=tmp_path / "ego.zip", **common)
     monkeypatch.undo()
     assert not (tmp_path / "ego.zip").exists()
     with pytest.raises(ValueError, match=r"There is an unfinished training in .* go on with --resume"):
@@ -155,15 +153,19 @@ def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_an_ego_stays_while_the_next_one_cannot_be_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: PPO, path: Path) -> None:
-        Path(path).write_bytes(b"half")
+    def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
     (tmp_path / "ego.zip").write_bytes(b"earlier")
-    monkeypatch.setattr(PPO, "save", fail)
-    with pytest.raises(OSError, match="No space left"):
-        train_ego(ENV, steps=64, num_envs=4, out=tmp_path / "ego.zip", progress=False)
+    monkeypatch.setattr(training.ego_training, "replace_file", full)
+    common: dict[str, Any] = {"steps": 64, "num_envs": 4, "out": tmp_path / "ego.zip", "progress": False}
+    with pytest.raises(ValueError, match=r"There is .*ego\.zip' already: .* --force"):
+        train_ego(ENV, **common)
+    with pytest.raises(OSError, match=r"No space left on device\. \d+ of 64 steps are kept .* with --resume"):
+        train_ego(ENV, force=True, **common)
     assert (tmp_path / "ego.zip").read_bytes() == b"earlier"
+    monkeypatch.undo()
+    train_ego(ENV, force=True, resume=True, **common)
     assert [path.name for path in tmp_path.iterdir()] == ["ego.zip"]
 
 
@@ -262,9 +264,9 @@ def test_a_resumed_retraining_ends_alike(
     given = Retraining(egos("sac"), FAILURE, share=0.5)
     common: dict[str, Any] = {"algo": "sac", "steps": STEPS, "num_envs": ROWS, "progress": False}
     whole = train_ego(ENV, out=tmp_path / "whole.zip", retraining=given, **common)
-    stop_after(monkeypatch, 4)
-    with pytest.raises(Stopped):
-        train_ego(ENV, out=tmp_path / "on.zip", retraining=given, checkpoint_interval=0.0, **common)
+    stop_after(monkeypatch, "sac", 2)
+    with pytest.raises(TrainingInterrupted):
+        train_ego(ENV, out=tmp_path / "on.zip", retraining=given, **common)
     monkeypatch.undo()
     for other in (None, Retraining(egos("sac"), FAILURE, 0.4), Retraining(egos("sac"), FAILURE + 0.1, 0.5)):
         with pytest.raises(ValueError, match="is of a training with other arguments"):

@@ -10,6 +10,7 @@ one file of a base.
 
 from __future__ import annotations
 
+import glob
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -30,6 +31,7 @@ from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
+from training.checkpoints import TrainingInterrupted
 from training.command_line import EventOptions
 from training.data.columns import Gaps
 from training.data.events import (
@@ -179,7 +181,7 @@ def fit_own_bases(
         pooled[scenario] = {column: np.concatenate([events[column] for events in own]) for column in own[0]}
         write_events(pooled[scenario], out / f"{scenario}_events.csv")
         typer.echo(out / f"{scenario}_events.csv")
-    too_few, written = 0, []
+    too_few, written = 0, list[Path]()
     for scenario in chosen:
         path, recipe = out / f"{scenario}_events.csv", EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, recorded_parameters(scenario))
@@ -195,6 +197,11 @@ def fit_own_bases(
                     typer.echo(f"{scenario}: {found - len(events.joint)} left out: {events.log[-2]['rule']}", err=True)
             frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
             base = fit_base(scenario, events, source, COMMAND, frequency=frequency, **asked)
+        except KeyboardInterrupt:
+            rest = " ".join(f"--scenario {each}" for each in chosen[chosen.index(scenario) :])
+            raise TrainingInterrupted(
+                f"Stopped: {len(written)} of {len(chosen)} bases are written; {rest} --force fits the others."
+            ) from None
         except ValueError as error:
             too_few += 1
             words = f"{path}: {error} No base of {{}} is written"
@@ -219,11 +226,13 @@ def fit_bases(
     n_refits: int | None = None,
     seed: int = 0,
     progress: bool = False,
+    force: bool = False,
 ) -> list[Path]:
     """Fit base distributions to recordings, or those of the package to its events; return their files in a folder.
 
     None of the scenarios stands for all that have enough events; the others are left out with a line on standard error,
-    unless there is none. A ValueError or an OSError says which argument, file or recording is wrong.
+    unless there is none. A ValueError or an OSError says which argument, file or recording is wrong; `force` replaces
+    files that are there already.
     """
     kind, path = recordings.kind_and_path()
     known = tuple(EVENT_RECIPES)
@@ -231,6 +240,10 @@ def fit_bases(
         raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
     if not name or Path(name).name != name:
         raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")
+    endings = ("*.json",) if kind == "data" else ("events.csv", f"{glob.escape(name)}.json")
+    there = [file for each in scenarios or known for end in endings for file in out.glob(f"{each}_{end}")]
+    if there and not force:
+        raise ValueError(f"There is {str(there[0])!r} already: choose another folder, or replace it by --force.")
     if kind == "data":
         from training.recipes.bases import fit_shipped_bases
 

@@ -22,6 +22,8 @@ from agents.learned.networks import Policy
 from rare_envs.devices import find_device
 from rare_envs.files import parse_json_object, read_text_file, replace_text
 from rare_envs.startup import advise_install
+from samplers.estimation import defer_signals
+from training.checkpoints import TrainingInterrupted
 from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.imitation.config import Config
@@ -194,6 +196,9 @@ def train_learner(
         progress: Show a bar on standard error.
         every: Number of updates between checkpoints.
 
+    Raises:
+        TrainingInterrupted: After a signal, which waits for the end of an update; `out` has what is done.
+
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
         >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
@@ -210,15 +215,24 @@ def train_learner(
         learner.load(out / CHECKPOINT)
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     bar = Progress(*columns, console=Console(stderr=True), disable=not progress)
-    with bar, _tensorboard(out if log else None, learner.update) as writer:
-        task = bar.add_task("", total=learner.config.updates, completed=learner.update)
-        for entry in run_updates(learner):
-            text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic"))
-            bar.update(task, completed=learner.update, description=text)
-            for name, value in (*entry.items(), ("vehicle_steps", learner.simulated)) if writer else ():
-                writer.add_scalar(name, value, learner.update)
-            if out is not None and (learner.update % every == 0 or learner.update == learner.config.updates):
-                learner.save(out / CHECKPOINT)
+    stopped = KeyboardInterrupt("stopped")
+    try:
+        with bar, _tensorboard(out if log else None, learner.update) as writer, defer_signals() as received:
+            task = bar.add_task("", total=learner.config.updates, completed=learner.update)
+            for entry in run_updates(learner):
+                text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic"))
+                bar.update(task, completed=learner.update, description=text)
+                for name, value in (*entry.items(), ("vehicle_steps", learner.simulated)) if writer else ():
+                    writer.add_scalar(name, value, learner.update)
+                n, whole = learner.update, learner.config.updates
+                if out is not None and (received or n % every == 0 or n == whole):
+                    learner.save(out / CHECKPOINT)
+                    kept = f"{n:,} of {whole:,} updates are kept in {str(out)!r}"
+                    stopped = TrainingInterrupted(f"Stopped: {kept}: go on by the same command.")
+                if received:
+                    break
+    except KeyboardInterrupt:
+        raise stopped from None
     return learner.policy
 
 
@@ -319,7 +333,8 @@ def claim_folder(out: Path, source: Source, config: Config) -> Iterator[None]:
     if out.exists() and not out.is_dir():
         raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
     begun, noted = any((out / name).exists() for name in (CHECKPOINT, DRIVER)), out / SETTINGS_FILE
-    if begun and noted.exists() and parse_json_object(read_text_file(noted), repr(str(noted))) != json.loads(text):
+    noted_text = read_text_file(noted) if begun and noted.exists() else "{}"
+    if begun and parse_json_object(noted_text, repr(str(noted))) != json.loads(text):
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
     yield
     try:

@@ -45,6 +45,7 @@ def train_ego_command(
     num_envs: Annotated[int, Option(help="Episodes that run side by side.")] = 256,
     device: Annotated[str, Option(help="Where to simulate and to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
     resume: Annotated[bool, Option("--resume", help="Go on with a training that was interrupted.")] = False,
+    force: shell.ForceOption = False,
     from_failures: Annotated[
         list[Path] | None,
         Option(
@@ -87,7 +88,9 @@ def train_ego_command(
     settings: dict[str, Any] = {**world, "retraining": retraining, **({} if device == "cpu" else {"device": device})}
     settings["even_strata"] = even_strata
     with as_bad_input(ValueError, OSError):
-        path = train_ego(ids, algo, steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **settings)
+        path = train_ego(
+            ids, algo, steps, out=out, seed=seed, num_envs=num_envs, resume=resume, force=force, **settings
+        )
     data = {"ego": str(path), "env_id": ids[0] if len(ids) == 1 else ids, "algo": algo, "steps": steps, "seed": seed}
     data |= {**world, "even_strata": even_strata}
     if retraining is not None:
@@ -140,7 +143,7 @@ def train_drivers_command(out: RunFolderOption, recordings: RecordingOptions, op
     from training.imitation.config import Config
     from training.imitation.train import Source, train_driver
 
-    with as_bad_input(ValueError):
+    with as_bad_input(ValueError, OSError):
         config = Config(options.method, options.seed, options.updates)
         path = train_driver(Source(*recordings.kind_and_path()), config, out, progress=True, device=options.device)
     data = {"driver": str(path), "method": options.method, "seed": options.seed}
@@ -159,14 +162,14 @@ def fit_command(
     name: Annotated[str, Option(help="Name of the bases of your own recordings.")] = "own",
     refits: Annotated[int | None, Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
     seed: Annotated[int, Option(help="Seed of the fits.", min=0)] = 0,
+    force: shell.ForceOption = False,
 ) -> Answer:
     """Fit base distributions to recorded traffic, with refits that say how far the events determine them."""
     from training.fit.recordings import fit_bases
 
+    settings: dict[str, Any] = {"scenarios": scenario, "name": name, "n_refits": refits, "seed": seed, "force": force}
     with output_folder(out), as_bad_input(ValueError, OSError):
-        files = fit_bases(
-            recordings, out, cut_gaps=cut_gaps, scenarios=scenario, name=name, n_refits=refits, seed=seed, progress=True
-        )
+        files = fit_bases(recordings, out, cut_gaps=cut_gaps, progress=True, **settings)
     lines = [f"{path}: rare-envs estimate ENV --base {path}" for path in files]
     return Answer({"bases": [str(path) for path in files]}, "\n".join(lines))
 
@@ -220,6 +223,7 @@ def export_ego_command(
     asked: dict[str, Any],
     model: Annotated[Path, Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
     out: Annotated[Path, Argument(metavar="OUT", help="The .onnx file to write.")],
+    force: shell.ForceOption = False,
 ) -> Answer:
     """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
     if model.suffix != ".zip":
@@ -228,7 +232,7 @@ def export_ego_command(
         )
     if out.suffix != ".onnx":
         raise BadInput(f"Expected a file that ends in .onnx, got {str(out)!r}.")
-    with output_file(out), as_bad_input(ValueError, OSError):
+    with output_file(out, force), as_bad_input(ValueError, OSError):
         from agents.onnx import ACTION_TOLERANCE, export_onnx
         from agents.saved_ego import load_saved_ego
 

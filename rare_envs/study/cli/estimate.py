@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,6 @@ from rare_envs.study.arguments import (
     ExecutorOptions,
     Question,
     as_bad_input,
-    output_file,
     read_mapping,
     read_question_file,
 )
@@ -117,6 +117,7 @@ def estimate_highway_env(
     import agents
     import rare_envs
     import samplers
+    from rare_envs.study import writing
     from rare_envs.study.arguments import FIRST_BATCH, RunInterrupted, describe_stop
 
     vehicles = str((config or {}).get("other_vehicles_type", "highway_env."))
@@ -135,7 +136,10 @@ def estimate_highway_env(
         problem = rare_envs.highway_env_problem(
             question.env_id, ego, measure=question.measure, noise=question.noise, fixed="highway_env", **settings
         )
-        with output_file(file):
+    command = f"estimate --env-config {json.dumps(config, sort_keys=True)}" if config else "estimate"
+    with writing.journals_of(command, out, {"": question}, force, ESTIMATE_FILE) as (journal,):
+        with as_bad_input(ValueError, OSError, TypeError):
+            arguments["journal"] = journal
             try:
                 result = samplers.estimate(problem, method, progress=True, executor=executor, **arguments)
             except samplers.EstimationInterrupted as stopped:
@@ -143,7 +147,8 @@ def estimate_highway_env(
                 raise RunInterrupted(describe_stop(stopped.estimate), known) from None
             except KeyboardInterrupt:
                 raise RunInterrupted(FIRST_BATCH) from None
-            if file is not None:
+        if file is not None:
+            with writing.unwritten_results(file.parent, _describe(question, problem, result, None)):
                 result.save(file)
     return _describe(question, problem, result, out)
 
@@ -257,7 +262,7 @@ def risk_command(
     force: shell.ForceOption = False,
 ) -> Answer:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
-    from rare_envs.study.risk import SCENARIO_SET, risk
+    from rare_envs.study.risk import SCENARIO_SET, Risk, risk
 
     if asked["max_rate"] is None:
         refuse_without_limit(typed, "--max-rate")
@@ -268,7 +273,13 @@ def risk_command(
         if owner in bases:
             raise BadInput(f"Expected one --base for each scenario, got several for {owner!r}.")
         bases[owner] = name
-    with as_bad_input(ValueError):
+
+    def tell(found: Any, wrote: str = "") -> Answer:
+        code = DOUBTFUL if found.warnings else 0
+        code = code if found.verdict is None else GATE_CODES[found.verdict.decision]
+        return Answer(found.to_dict(), f"{found}{wrote}", code)
+
+    with as_bad_input(ValueError), shell.telling_unwritten(Risk, tell):
         found = risk(
             ego,
             scenarios=_split_words(*scenario or ()) or SCENARIO_SET,
@@ -280,9 +291,7 @@ def risk_command(
             max_sim=max_sim,
             **asked,
         )
-    text = str(found) if out is None else f"{found}\nWrote {out}."
-    code = DOUBTFUL if found.warnings else 0
-    return Answer(found.to_dict(), text, code if found.verdict is None else GATE_CODES[found.verdict.decision])
+    return tell(found, "" if out is None else f"\nWrote {out}.")
 
 
 @command(*shell.ASKED, stopped=NOTHING_MADE)
@@ -303,7 +312,13 @@ def compare_command(
     from rare_envs.study.evaluate import compare_egos
 
     question = Question(env_id=env, ego=ego_a, max_sim=max_sim, **asked)
-    found, answer = compare_egos(question, ego_b, progress=True, out=out, force=force, algo_b=algo_b, stats_b=stats_b)
-    lines = [f"A = {ego_a}, B = {ego_b}, {env}", str(found), *(f"  note: {note}" for note in answer["notes"])]
-    lines += [] if out is None else [f"Wrote {out}."]
-    return Answer(answer, "\n".join(lines), DOUBTFUL if found.warnings else 0)
+
+    def tell(pair: Any, *wrote: str) -> Answer:
+        found, answer = pair
+        lines = [f"A = {ego_a}, B = {ego_b}, {env}", str(found), *(f"  note: {note}" for note in answer["notes"])]
+        return Answer(answer, "\n".join([*lines, *wrote]), DOUBTFUL if found.warnings else 0)
+
+    b: dict[str, Any] = {"algo_b": algo_b, "stats_b": stats_b}
+    with shell.telling_unwritten(tuple, tell):
+        pair = compare_egos(question, ego_b, progress=True, out=out, force=force, **b)
+    return tell(pair, *([] if out is None else [f"Wrote {out}."]))

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
-from rare_envs.study.arguments import BadInput, as_bad_input, output_file, output_folder
-from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, RunArgument, command
+from rare_envs.study.arguments import BadInput, as_bad_input, output_file, output_folder, refuse_existing
+from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, ForceOption, RunArgument, command
 
 if TYPE_CHECKING:
     from rare_envs.study.corpus import Trial
@@ -34,10 +34,12 @@ def report_command(
         Option(help="CSV of recorded events, with columns named as the parameters: how near they come."),
     ] = None,
     figures: Annotated[str | None, Option(help="Figures as files too, beside the page: svg, pdf or png.")] = None,
+    force: ForceOption = False,
 ) -> Answer:
     """Write the report of a run as one HTML file, with its failures by mode, driven again and filmed."""
     from rare_envs.study.html_report import write_html_report
 
+    refuse_existing(force, out, out and out.parent / "figures" if figures else None)
     page, *drawn = write_html_report(run, events=events, out=out, figures=figures, **asked)
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
     return Answer({"report": str(page), "figures": [str(path) for path in drawn]}, text)
@@ -67,16 +69,25 @@ def corpus_run_command(
     asked: dict[str, Any],
     corpus: CorpusOption = Path("corpus"),
     junit: Annotated[Path | None, Option(help="File for a JUnit report.")] = None,
+    force: ForceOption = False,
 ) -> Answer:
     """Try an ego in all scenarios of a corpus. Exit code 0: it fails in none; 4: it does."""
     from rare_envs.study.corpus import read_corpus, try_ego, write_junit
 
-    with output_file(junit):
+    with output_file(junit, force or _is_junit(junit)):
         trials, seconds = try_ego(read_corpus(corpus), corpus, ego, **asked)
         if junit is not None:
             with _unwritten(junit):
                 write_junit(junit, trials, ego, seconds)
     return _describe_tries(trials, seconds, ego)
+
+
+def _is_junit(path: Path | None) -> bool:
+    """Return whether a file is a JUnit report, which the next one replaces, as those of other tools do."""
+    if path is None or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b"<testsuites" in file.read(100)
 
 
 def replay_all(folder: Path, ego: str | None, trust: bool) -> Answer:
@@ -134,6 +145,7 @@ def replay_command(
     replay_each: Annotated[
         bool, Option("--all", help="Simulate all failures again and compare their f; without a film.")
     ] = False,
+    force: ForceOption = False,
 ) -> Answer:
     """Replay a failure that a run has found, and show it with its measure over time."""
     from rare_envs.study.plots import check_film_path, write_film
@@ -147,7 +159,7 @@ def replay_command(
         return replay_all(run, ego, **asked)
     if out is not None:
         check_film_path(out)
-    with output_file(out):
+    with output_file(out, force):
         recorded = find_failure(run, failure, asked["trust"], ego)
         drive = drive_again(recorded.problem, recorded.x)
         if out is not None:
@@ -181,6 +193,7 @@ def export_command(
         str | None,
         Option(help="recorded: it follows its trajectory; free: it only has a start. carla leaves it free."),
     ] = None,
+    force: ForceOption = False,
 ) -> Answer:
     """Write a failure as OpenSCENARIO and OpenDRIVE, for CARLA's scenario_runner, or as CommonRoad XML."""
     from rare_envs.study.export import check_export, export_scenario
@@ -188,7 +201,8 @@ def export_command(
 
     with as_bad_input(ValueError):
         check_export(out, format, ego)
-        with output_file(out):
+        refuse_existing(force or format == "commonroad", out.with_suffix(".xodr"))
+        with output_file(out, force):
             recorded = find_failure(run, failure, **asked)
             with _unwritten(out):
                 files = export_scenario(recorded.problem, recorded.x, out, format, ego)  # type: ignore[arg-type]

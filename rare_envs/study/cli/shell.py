@@ -25,7 +25,7 @@ from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone, clean_text
 from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
-from rare_envs.study.arguments import BadInput, ExecutorOptions, Question, option_name, read_whole
+from rare_envs.study.arguments import BadInput, ExecutorOptions, Question, UnwrittenResults, option_name, read_whole
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
@@ -77,6 +77,9 @@ class OneLineErrors(SummarisedCommands):
         ended = False
         try:
             restore_signals()
+            for stream in (sys.stdout, sys.stderr):  # which may be those of a test, or not take every name
+                if reconfigure := getattr(stream, "reconfigure", None):
+                    reconfigure(errors="backslashreplace")
             with signals_as_exceptions(received), one_line_warnings():
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
@@ -249,14 +252,26 @@ def answering(work: Callable[[], Answer | None], as_json: bool, stopped: str, de
     except (KeyboardInterrupt, BadInput) as error:
         report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
         # whoever ended the process may not wait for more than one line
-        if isinstance(error, KeyboardInterrupt) and (hasattr(error, "report") or stopped):
-            print_stderr(str(error) if hasattr(error, "report") else stopped)
+        own = type(error) is not KeyboardInterrupt  # such as `RunInterrupted`, with words of its own
+        if isinstance(error, KeyboardInterrupt) and (own or stopped):
+            print_stderr(str(error) if own else stopped)
         if report is not None:
             (report if isinstance(report, Answer) else describe_report(report, None, details)).print(as_json)
         raise
     if answer is not None:
         answer.print(as_json)
         raise typer.Exit(answer.code)
+
+
+@contextlib.contextmanager
+def telling_unwritten(kind: type[Any], tell: Callable[[Any], Answer]) -> Iterator[None]:
+    """Let the result, of a kind, of what cannot be written be told as an answer."""
+    try:
+        yield
+    except UnwrittenResults as error:
+        if isinstance(error.report, kind):
+            error.report = tell(error.report)
+        raise
 
 
 @contextlib.contextmanager
@@ -320,7 +335,7 @@ EnvArgument = Annotated[
 ]
 EgoArgument = Annotated[str, Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 RunArgument = Annotated[Path, Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
-ForceOption = Annotated[bool, Option("--force", help="Replace what the folder of --out has of an earlier run.")]
+ForceOption = Annotated[bool, Option("--force", help="Replace what is there already.")]
 DetailsOption = Annotated[
     bool, Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
 ]

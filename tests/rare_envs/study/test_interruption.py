@@ -121,10 +121,15 @@ def test_simulations_of_the_further_run_are_not_those_of_the_run(
 
 def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("compare", "egos_here:coasting", "idm", *WORDS[1:-4], "--base", risky, "--max-sim", "60000")
-    stop_after(25_000, monkeypatch)
-    result = cli(*words)
+    with monkeypatch.context() as patch:
+        stop_after(25_000, patch)
+        result = cli(*words, "--out", "both")
     assert result.exit_code == 143
     assert result.stderr.startswith("Stopped after 10,000 simulations: P[A or B fails] so far ")
+    assert "20,000 simulations are kept; go on with: the same command again, without --force.\n" in result.stderr
+    both, whole = (json.loads(cli(*words, "--out", folder, "--json").stdout) for folder in ("both", "whole"))
+    assert both == whole
+    assert sorted(path.name for path in Path("both").iterdir()) == ["comparison.json", "failures.csv"]
     stop_after(300, monkeypatch)
     assert_stopped(cli(*words), "Stopped: no estimate yet, the first batch of simulations was not complete.")
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import rare_envs
@@ -25,7 +26,7 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, writing
 from rare_envs.study.arguments import BadInput, Question
 from rare_envs.study.question import digest_files, prepare
-from rare_envs.study.run_folder import JOURNAL, RESULT_FILES
+from rare_envs.study.run_folder import EPISODES, JOURNAL, RESULT_FILES, load_study
 from rare_envs.study.writing import begin_journal, continue_journal
 from samplers import journal as journals
 from samplers.journal import COLUMNS, Journal, _Row
@@ -302,7 +303,7 @@ def test_a_remote_ego_that_is_killed_for_good_and_started_later(
 # The disk and the folder
 
 
-def full(*_: Any) -> Any:
+def full(*_: Any, **__: Any) -> Any:
     raise OSError(28, "No space left on device")
 
 
@@ -314,15 +315,18 @@ def test_a_full_disk_is_one_line_at_the_start_and_at_the_end_costs_nothing(
         assert_refused(cli(*SMALL, "--out", frail / "new" / "run"), "Cannot write", "No space left on device")
     words = (*SMALL[:-1], 600, "--base", risky, "--json", "--out")
     whole = cli(*words, "whole")
-    with monkeypatch.context() as patch:
-        patch.setattr(writing, "write_run", full)
-        ended = cli(*words, "run")
-    assert ended.exit_code == 2
-    assert json.loads(ended.stdout)["p"] == json.loads(whole.stdout)["p"] > 0
-    assert "Cannot write the results to" in ended.stderr and "Traceback" not in ended.stderr
-    assert "No space left on device. 600 simulations are kept; go on with: rare-envs resume run" in ended.stderr
-    assert cli("resume", "run").exit_code in (0, 3)
-    assert answer(RUN) == answer(WHOLE)
+    table = load_study("whole").episodes().drop_columns(["seconds"])
+    for owner, name, said in ((writing, "write_run", "Cannot write the results"), (pq, "ParquetWriter", EPISODES)):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, full)
+            ended = cli(*words, "run", "--force")
+        assert ended.exit_code == 2
+        assert json.loads(ended.stdout)["p"] == json.loads(whole.stdout)["p"] > 0
+        assert said in ended.stderr and "Traceback" not in ended.stderr
+        assert "No space left on device. 600 simulations are kept; go on with: rare-envs resume run" in ended.stderr
+        assert cli("resume", "run").exit_code in (0, 3)
+        assert answer(RUN) == answer(WHOLE)
+        assert load_study("run").episodes().drop_columns(["seconds"]) == table
 
 
 @pytest.mark.parametrize("back", [True, False])

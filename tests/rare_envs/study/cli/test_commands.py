@@ -114,9 +114,11 @@ def test_an_ego_is_trained_on_with_the_failures_of_its_runs(cli: Cli, risky: str
     answer = json.loads(trained.stdout)
     expected = {"env_id": FOLLOWING, "algo": "a2c", "base": risky, "retrained": str(ego), "failures": sum(found)}
     assert answer.items() >= {**expected, "failure_share": 0.5}.items()
-    printed = cli("train-ego", "--from-failures", runs[0], "--out", on, *words[:-1]).stdout.replace("\n", " ")
+    printed = cli("train-ego", "--from-failures", runs[0], "--out", on, "--force", *words[:-1]).stdout.replace(
+        "\n", " "
+    )
     assert f"--base {risky} --seed 8" in printed.replace("  ", " ")
-    one = ("train-ego", "--from-failures", runs[0], "--out", on)
+    one = ("train-ego", "--from-failures", runs[0], "--out", on, "--force")
     assert_refused(cli(*one, "--algo", "ppo"), "Expected --algo a2c", "'ppo'")
     assert_refused(cli("train-ego", "rare_envs/CutIn-v0", *one[1:]), f"Expected ENV {FOLLOWING}")
     assert_refused(cli(*one, "--failure-share", 1), "share of failures above 0 and below 1")
@@ -147,7 +149,7 @@ def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest
     assert "progress" in answer.stderr
     given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["cut_in"], "n_refits": 3}
     assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True}
-    assert cli("fit", *words).stdout == f"{file}: rare-envs estimate ENV --base {file}\n"
+    assert cli("fit", *words, "--force").stdout == f"{file}: rare-envs estimate ENV --base {file}\n"
 
 
 def test_an_ego_is_checked_in_the_traffic_that_is_asked_for(cli: Cli) -> None:

@@ -108,6 +108,12 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     ((*EXPORT, "a.xml"), ("ends in .xosc for openscenario", "--format commonroad writes")),
     ((*EXPORT, "a.xosc", "--format", "opensenario"), ("openscenario",)),
     ((*EXPORT, "a.xosc", "--format", "carla", "--ego", "recorded"), ("free",)),
+    ((*TRAIN, "--out", "corrupt.zip"), ("There is 'corrupt.zip' already", "--force")),
+    (("export-ego", "corrupt.zip", "kept/a.onnx"), ("'kept/a.onnx' already",)),
+    (("replay", "run", "--out", "old.gif"), ("'old.gif' already",)),
+    (("report", "run", "--out", "old.gif"), ("'old.gif' already",)),
+    ((*EXPORT, "old.xosc"), ("'old.xodr' already",)),
+    (("corpus", "run", "--ego", "idm", "--junit", "old.gif"), ("'old.gif' already",)),
     (("corpus", "run"), ("--ego", "See rare-envs corpus run --help.")),
     (("corpus", "run", "--ego", "idm"), ("There is no corpus",)),
     (("corpus", "run", "--ego", "idm", "--junit", "run/result.json/a.xml"), ("Cannot make the folder",)),
@@ -126,6 +132,9 @@ def test_bad_input_is_one_line_and_leaves_no_file(
     shutil.copytree(finished_run, here / "run")
     for name in ("cut_in", "hard_brake"):
         write_fitted(here / f"{name}.json", name)
+    (here / "kept").mkdir()
+    for name in ("kept/a.onnx", "old.gif", "old.xodr"):
+        (here / name).write_text("mine", encoding="utf-8")
     before = set(here.iterdir())
     for words, said in REFUSED:
         refused = cli(*words)
