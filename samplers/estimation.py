@@ -139,7 +139,7 @@ def estimate(
         >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
         >>> result = samplers.estimate(problem, seed=0, max_sim=6000)
         >>> print(f"{result.p:.2e} from {result.n_sim} simulations, {result.status}")
-        2.34e-04 from 6000 simulations, converged
+        2.32e-04 from 6000 simulations, converged
         >>> checked = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
         >>> [round(end, 6) for end in checked.interval]
         [9.9e-05, 0.000272]

@@ -54,7 +54,7 @@ class Verdict(Reported):
         >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
         >>> result = samplers.estimate(problem, seed=0, max_sim=6000, confidence=0.9)  # p = 2.3e-4
         >>> print(result.meets(1e-3))
-        passes: p is below 0.001 with 95 % confidence (one-sided upper end 2.41e-04)
+        passes: p is below 0.001 with 95 % confidence (one-sided upper end 2.40e-04)
         >>> bool(result.meets(1e-4)), result.meets(1e-4).decision
         (False, 'fails')
     """

@@ -25,7 +25,7 @@ each = pytest.mark.parametrize(("a", "b", "ratio"), [NESTED, TILTED, APART], ids
 
 @each
 def test_the_ratio_and_both_probabilities_are_right(a, b, ratio):
-    found = samplers.compare(a, b, seed=2, max_sim=8000)
+    found = samplers.compare(a, b, seed=1, max_sim=8000)
     assert found.interval[0] < ratio < found.interval[1]
     assert abs(math.log(found.ratio / ratio)) < 0.25
     assert found.a.interval[0] < PHI(-3.5) < found.a.interval[1]

@@ -116,12 +116,12 @@ def test_after_hardly_any_simulations_one_line_says_what_is_known(method, max_si
 
 
 def test_of_a_run_that_was_stopped_the_interval_holds_that_of_the_sampling():
-    """Of the first batch of a search, some dozen failures, a c.o.v. above 0.3: few draws are worth a wider quantile."""
+    """Of the first batch of a search, some dozen failures, a c.o.v. above 0.4: few draws are worth a wider quantile."""
     started = samplers.TwoStage().start(HalfSpace(fitted([normal()] * 30)), seed=1, max_sim=3000)
     started.tell(BETA - started.ask()[:, 0])
     result = started.result()
     low, high = result.base_uncertainty.interval
-    assert result.n_sim < 3000 and result.failures.total < 40 and result.cov > 0.3
+    assert result.n_sim < 3000 and result.failures.total < 40 and result.cov > 0.4
     assert low <= result.interval[0] < result.interval[1] <= high
     assert str(result).count("base distribution 95 %") == 1
 
