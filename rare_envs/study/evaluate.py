@@ -42,7 +42,16 @@ from rare_envs.study.arguments import BadInput, Question, RunInterrupted, Unwrit
 from rare_envs.study.ego_check.checks import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures
-from rare_envs.study.question import Study, build_problem, digest_files, find_changed_files, open_question, prepare
+from rare_envs.study.question import (
+    Study,
+    build_problem,
+    digest_files,
+    find_changed_files,
+    list_risks,
+    note_question,
+    open_question,
+    prepare,
+)
 from rare_envs.study.report import Repeatability, Report, find_frequency
 from rare_envs.study.run_folder import BLOCKS, FAILURES, RESULT_FILES, STUDY
 from samplers.estimation import add_ensemble_run, check_base, run_method
@@ -366,6 +375,8 @@ def resume(
         if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun
             study = replace(study, question=replace(question, chunk=study.problem.tile))
         writing.note_resumption(folder, journal.earlier_seconds)
+        if ego is not None and list(list_risks(question)) == ["ego"]:
+            note_question(study.question)  # the address is the reader's own
         with _keeping(folder, study, journal) as target:
             return _finish(target, run(study, progress, journal, executor, target), journal, keep=bool(part_of))
 

@@ -24,6 +24,7 @@ from rare_envs.study.question import (
     list_risks,
     note_question,
     open_question,
+    open_run,
 )
 from rare_envs.study.replay import find_failure
 from rare_envs.study.run_folder import EPISODES, FAILURES, PLOT, RESULT, RESULT_FILES, STUDY, load_study
@@ -126,6 +127,19 @@ def test_an_ego_of_the_readers_own_is_asked_no_trust_but_the_rest_of_the_questio
     change_question(received, measure="evil:gap")
     with pytest.raises(BadInput, match=r"runs code: 'evil:gap' \("):
         find_failure(received, 0, ego="idm")
+
+
+def test_a_run_that_went_on_with_an_address_of_ones_own_needs_no_trust(
+    received: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agents, "load_ego", lambda *_, **__: "idm")
+    question = Question(env_id=FOLLOWING, ego="tcp://127.0.0.1:9", base="us101-gap", method="mc", max_sim=100)
+    Path("begun").mkdir()
+    begin_journal(Path("begun"), question).close()
+    with pytest.raises(BadInput, match="add --trust"):
+        resume(Path("begun"))
+    resume(Path("begun"), ego="tcp://127.0.0.1:8")
+    assert open_run(load_study("begun"), trust=False).ego == "tcp://127.0.0.1:8"
 
 
 def test_modules_of_ones_own_get_nothing_from_somebody_elses_folder(
