@@ -28,7 +28,7 @@ from samplers.output import (
     register_stored,
     to_json_value,
 )
-from samplers.problem import FloatArray, Problem, check_whole, names_of_columns
+from samplers.problem import FloatArray, Problem, check_whole, names_of_columns, one_per_row
 from samplers.replicate import UNRESOLVED_SHARE
 from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
@@ -183,7 +183,7 @@ class EitherFails:
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Simulate the rows of x (n, d) with both; return the smaller outcome of each, shape (n,)."""
-        f = np.stack([np.asarray(problem.evaluate(x), dtype=np.float64) for problem in self._problems])
+        f = np.stack([one_per_row(problem.evaluate(x), len(x)) for problem in self._problems])
         self.n_sim += 2 * len(x)
         least = np.asarray(f.min(axis=0))
         for row in np.flatnonzero(least <= self._gamma):

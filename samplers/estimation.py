@@ -102,8 +102,9 @@ def estimate(
         replicates: Independent runs, side by side: f gets the points of all of them in one batch, and each has an equal
             share of max_sim. Counts of MonteCarlo are pooled (Clopper-Pearson); others are combined by their mean with
             a t interval on the log scale, which is very wide with 2 or 3 runs.
-        on_error: Where f raises or returns NaN: "raise" stops and names the row; "failure" counts the point as failing;
-            "bound" counts it as failing in p and in the upper end of the interval, but not in the lower end.
+        on_error: Where f raises or returns NaN, twice: "raise" stops and names the row; "failure" counts the point as
+            failing; "bound" counts it as failing in p and in the upper end of the interval, but not in the lower end.
+            Of a batch that raises at most 1.2 times the rows are simulated again, beside max_sim.
         progress: True for a bar on standard error, or a function that gets `Progress`.
         time_limit: Seconds after which the run is stopped, checked after every batch.
         stop: Function that gets `Progress` after every batch; the run is stopped when it returns True.

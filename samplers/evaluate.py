@@ -8,7 +8,6 @@ counted. `samplers.executors` has the workers.
 
 from __future__ import annotations
 
-import math
 import random
 import sys
 import time
@@ -34,6 +33,7 @@ from samplers.problem import (
     describe_point,
     names_of_columns,
     one_per_row,
+    read_numbers,
 )
 
 CHUNK_SIZE = 16
@@ -42,6 +42,8 @@ N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first chunk to the largest."""
 F_TOLERANCE = 1e-3
 """Largest difference of f there, as a share of the largest |f|: products of networks round differently by batch."""
+WASTED_SHARE = 0.1
+"""Rows in parts that raise, while those that raise are looked for, as a share of the chunk and of the rows done."""
 NAN_REASON = "f is NaN"
 
 Index = tuple[int, ...]
@@ -82,50 +84,45 @@ def join_results(parts: Sequence[Result]) -> Result:
 def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable[..., None]) -> Result:
     """Return what the rows of a chunk give, those that fail left out; notes have their `reasons` as a dict by row.
 
-    Where an attempt raises, its parts are attempted (`split_rows`), until the rows that raise stand alone. A row that
-    has given nothing is attempted once more; if that gives nothing either, `fail(row, reason, error)` is told, which
-    may raise.
+    Where the attempt at all rows raises, they are attempted in parts until the rows that raise stand alone. The parts
+    are as large as lets no more than a tenth of the chunk and of the rows done be in parts that raise: it all takes 1.2
+    attempts a row at most, and the fewer calls the fewer rows raise. A row that has given nothing is attempted once
+    more; if that gives nothing either, `fail(row, reason, error)` is told, which may raise.
     """
     n_retried, lost, found = 0, dict[int, str](), list[tuple[NDArray[np.int64], Result]]()
-    unsure: dict[int, str] | None = None
-    todo = [(np.arange(len(chunk)), False)]
-    while todo:
-        rows, again = todo.pop()
-        n_retried += len(rows) if again else 0
-        try:
-            found.append((rows, attempt(chunk if len(rows) == len(chunk) else chunk.take(rows))))
-        except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
-            if getattr(error, "final", False):  # calling f again cannot help
-                raise
-            if again and len(rows) == 1:
-                lost[int(rows[0])] = reason_of(error)
-                fail(int(rows[0]), lost[int(rows[0])], error)
-                found.append((rows, Result(np.full((1, 1), np.nan), {})))
-            else:
-                todo += [(part, True) for part in reversed(split_rows(rows, error, len(chunk)))]
-        if not todo and unsure is None:
-            unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
-            todo = [(np.array(sorted(unsure)), True)] if unsure else []
+
+    def go_through(rows: NDArray[np.int64], again: bool) -> None:
+        nonlocal n_retried
+        size, spare = len(rows), WASTED_SHARE * len(rows)
+        while len(rows):
+            part = rows[:size]
+            n_retried += len(part) if again else 0
+            try:
+                found.append((part, attempt(chunk if len(part) == len(chunk) else chunk.take(part))))
+                spare += WASTED_SHARE * len(part)
+                rows = rows[size:]
+            except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
+                if getattr(error, "final", False):  # calling f again cannot help
+                    raise
+                if again and len(part) == 1:
+                    lost[int(part[0])] = reason_of(error)
+                    fail(int(part[0]), lost[int(part[0])], error)
+                    found.append((part, Result(np.full((1, 1), np.nan), {})))
+                    rows = rows[1:]
+                spare -= len(part) if again and len(part) > 1 else 0.0
+                again = True
+            size = max(1, int(spare / 2))
+
+    go_through(np.arange(len(chunk)), again=False)
+    unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
+    go_through(np.array(sorted(unsure), dtype=np.int64), again=True)
     whole = join_results([each for _, each in found])
     table = np.empty((len(chunk), whole.table.shape[1]))
     table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands
-    again_failed = {row: why for row, why in (unsure or {}).items() if np.isnan(table[row, 0])}
+    again_failed = {row: why for row, why in unsure.items() if np.isnan(table[row, 0])}
     for row in sorted(set(again_failed) - set(lost)):
         fail(row, again_failed[row])
     return Result(table, {**whole.notes, "reasons": {**again_failed, **lost}, "n_retried": n_retried})
-
-
-def split_rows(rows: NDArray[np.int64], error: BaseException, whole: int) -> list[NDArray[np.int64]]:
-    """Return the parts in which rows are attempted after an error.
-
-    Halves take the fewest attempts. Where the error means that an answer was waited for (its attribute `waits`),
-    attempts are cheaper than errors: then parts of about the root of the whole chunk, and after that each row alone.
-    """
-    if not getattr(error, "waits", False):
-        return np.array_split(rows, min(2, len(rows)))
-    root = math.isqrt(whole)
-    size = root if 1 < root < len(rows) else 1
-    return np.split(rows, range(size, len(rows), size))
 
 
 def reason_of(error: BaseException) -> str:
@@ -194,7 +191,7 @@ def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
     n, notes, reasons = len(x), dict[str, Any](), dict[int, str]()
     if chunk.kind == "gradient":
         found = problem.gradient(x, *about, gamma)
-        table = np.asarray(found.values, dtype=np.float64)
+        table = read_numbers(found.values, f"gradients of shape {x.shape}")
         if table.shape != x.shape:
             raise EvaluationError(f"Expected gradients of shape {x.shape}, got {table.shape}.")
         return Result(table, {"cost": float(found.cost), "reasons": {}})
@@ -207,7 +204,8 @@ def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
         f = one_per_row(found, n)
         table = f[:, None]
     else:
-        f, values, ticks = one_per_row(found.f, n), np.asarray(found.values, float), np.asarray(found.ticks)
+        f, values = one_per_row(found.f, n), read_numbers(found.values, f"terms of shape ({n}, J)")
+        ticks = np.asarray(found.ticks)
         if values.ndim != 2 or len(values) != n or values.shape[1] == 0 or ticks.shape != values.shape:
             raise EvaluationError(f"Expected values and ticks of shape ({n}, J), got {values.shape} and {ticks.shape}.")
         f = np.where(np.isnan(values).any(axis=1), np.nan, f)

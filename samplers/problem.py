@@ -85,20 +85,59 @@ class EvaluationError(ValueError):
     final = True
 
 
-def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
+NO_NUMBERS = {
+    "b": "booleans, of which none is more dangerous: return numpy.where(fails, -1.0, 1.0) or, better, a margin",
+    "c": "complex numbers, which have no order",
+    "S": "text",
+    "U": "text",
+    "m": "times: divide them by numpy.timedelta64(1, 's')",
+}
+"""What f may not return, in words, by the kind of array that it is in NumPy."""
+
+
+def read_numbers(values: Any, wanted: str) -> NDArray[np.float64]:
+    """Return real numbers of foreign code as float64, of the same shape; NaN where they are masked or missing.
+
+    Integers that NaN becomes where it is cast to them count as missing. An EvaluationError says what was `wanted`.
+    """
+    try:
+        return _to_float64(values)
+    except Exception as error:  # of foreign arrays, whatever it is: it would be the same at other points
+        raise EvaluationError(f"Expected {wanted}: {' '.join(str(error).split()).rstrip('.')}.") from error
+
+
+def _to_float64(values: Any) -> NDArray[np.float64]:
+    """Return values as `read_numbers` does; a TypeError for what is no number."""
+    values, mask = values.detach().cpu() if hasattr(values, "detach") else values, np.ma.getmask(values)  # of torch
+    if isinstance(values, list | tuple) and any(not is_number(one) and np.ndim(one) == 0 for one in values):
+        values = np.array([_read_cell(cell) for cell in values])
+    array = np.asarray(values)
+    if array.dtype.kind == "O":
+        array = np.array([_read_cell(cell) for cell in array.flat]).reshape(array.shape)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"got {NO_NUMBERS.get(array.dtype.kind, f'an array of {array.dtype}')}")
+    if array.dtype.kind == "i" and array.dtype.itemsize >= 4:
+        mask = mask | (array == np.iinfo(array.dtype).min)
+    f = array.astype(np.float64, copy=False)
+    return np.where(mask, np.nan, f) if np.any(mask) else f
+
+
+def _read_cell(cell: Any) -> float:
+    """Return an element of a list or of an array of objects as a number; NaN for what is called missing."""
+    if cell is None or type(cell).__name__ in ("NAType", "NaTType"):  # those of pandas
+        return math.nan
+    if isinstance(cell, bool | str | bytes | complex):
+        cell = np.asarray(cell)
+    return float(_to_float64(cell) if hasattr(cell, "dtype") else cell)
+
+
+def one_per_row(outcomes: Any, n: int) -> NDArray[np.float64]:
     """Return the outcomes of foreign code as float64, shape (n,); an EvaluationError unless they are n real numbers."""
     if outcomes is None:
         raise EvaluationError(
             f"Expected f to return shape ({n},), one value per row of x, got None: f has no `return`."
         )
-    try:
-        if np.iscomplexobj(outcomes):
-            raise TypeError("complex numbers have no order")
-        f = np.asarray(outcomes, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise EvaluationError(
-            f"Expected f to return shape ({n},), one number per row of x: {str(error).rstrip('.')}."
-        ) from error
+    f = read_numbers(outcomes, f"f to return shape ({n},), one number per row of x")
     if f.shape != (n,):
         raise EvaluationError(f"Expected f to return shape ({n},), one value per row of x, got {f.shape}.")
     return f
@@ -433,7 +472,7 @@ class FunctionProblem:
         try:
             f = self.f(x)
         except Exception as error:  # the function is the user's
-            if _takes_one_point(self.f, x):
+            if (len(x) > 1 or self.chunk_size == 1) and _takes_one_point(self.f, x):  # of few of the attempts at a row
                 raise EvaluationError(f"f raised {type(error).__name__} ({error}): {hint}") from error
             raise
         try:
@@ -441,7 +480,9 @@ class FunctionProblem:
         except EvaluationError as error:
             if str(error).endswith(f"got {(len(x), 1)}."):  # as functions of OpenTURNS return
                 hint = "Return its only column, f(x)[:, 0]."
-            raise EvaluationError(str(error) if f is None else f"{error} {hint}") from error
+            if f is None or not isinstance(error.__cause__, ValueError | None):  # the shape is not what is wrong
+                raise
+            raise EvaluationError(f"{error} {hint}") from error
 
 
 def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:
@@ -460,7 +501,7 @@ def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:
 def _call_terms(function: Callable[..., ArrayLike], dim: int, x: FloatArray, gamma: float = 0.0) -> Terms:
     """Return `Problem.terms` by a function from points (n, d) to terms (n, J); f is their least."""
     _check_points(x, dim)
-    values = np.asarray(function(x), dtype=np.float64)
+    values = read_numbers(function(x), f"terms of shape ({len(x)}, J)")
     if values.ndim != 2 or len(values) != len(x) or values.shape[1] == 0:
         raise EvaluationError(f"Expected terms of shape ({len(x)}, J), one row per row of x, got {values.shape}.")
     return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=np.int64), gamma)
@@ -477,7 +518,7 @@ def _call_gradient(
 ) -> TermGradients:
     """Return `Problem.gradient` by a function from points (n, d) and terms (n,), the same for every gamma."""
     _check_points(x, dim)
-    return TermGradients(np.asarray(function(x, term), dtype=np.float64), cost * len(x))
+    return TermGradients(read_numbers(function(x, term), f"gradients of shape {x.shape}"), cost * len(x))
 
 
 def _check_points(x: FloatArray, dim: int) -> None:

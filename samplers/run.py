@@ -400,6 +400,8 @@ class Run:
             remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
         if whole.p == 0:
             remarks.append(advise(self._n_sim, self._closest))
+        if whole.p > 0.5:
+            remarks.append(f"Most x have f <= {goal.gamma:g}, which counts as failing: where large f is, give -f.")
         number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
         found = {"status": status, "warnings": tuple(warnings), "remarks": tuple(remarks), "parts": parts}
         interval = self._find_ends(whole)

@@ -141,10 +141,9 @@ def _isolate_failing_rows(
 ) -> tuple[Tensor, dict[int, str]]:
     """Query again after an error, in parts of the `whole` until the rows that fail stand alone.
 
-    The rule is that of `samplers.evaluate.split_rows`, for the rows of one tick: no other tick is driven again. Halves
-    take the fewest queries. If no answer came, queries are cheap, but waiting for one that does not come, or for a
-    process that starts again, is not: then the root of the whole batch, and after that each row alone. The error is
-    raised if the policy turns out to have a memory.
+    These are the rows of one tick: no other tick is driven again. Halves take the fewest queries. If no answer came,
+    queries are cheap, but waiting for one that does not come, or for a process that starts again, is not: then the root
+    of the whole batch, and after that each row alone. The error is raised if the policy turns out to have a memory.
     """
     n = len(query.start)
     root = math.isqrt(whole) if isinstance(error, NoAnswer) else (n + 1) // 2

@@ -33,6 +33,7 @@ from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.plugins import check_name
 from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS
+from samplers.problem import read_numbers
 
 TTC_MIN = 0.01
 """They are at least this [s], so that only a collision comes to 0 or less."""
@@ -284,7 +285,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         road.step = step_and_measure
 
     def _measure_now(self) -> float:
-        value = float(self._measure(self.scene))
+        value = float(read_numbers(self._measure(self.scene), f"a number from the measure {self._measure!r}"))
         if math.isnan(value):
             raise ValueError(f"The measure {self._measure!r} gave NaN; expected a number that is small in danger.")
         return value

@@ -163,11 +163,12 @@ class EpisodeMeasure(ABC):
 
 def check_one_each(value: Any, like: Tensor) -> Tensor:
     """Return what a measure's function gave, if it is one number for each of B episodes, as `like` (B,) has."""
-    if isinstance(value, Tensor) and value.shape == like.shape:
+    if isinstance(value, Tensor) and value.shape == like.shape and value.dtype != torch.bool:
         return value
-    came = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
+    came = f"a tensor of shape {tuple(value.shape)}, {value.dtype}" if isinstance(value, Tensor) else repr(value)
     raise ValueError(
-        f"Expected one number for each of {len(like)} episodes, a tensor of shape ({len(like)},), got {came}."
+        f"Expected one number for each of {len(like)} episodes, a tensor of shape ({len(like)},), small where it is "
+        f"dangerous, got {came}."
     )
 
 

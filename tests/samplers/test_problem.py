@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
 
 import samplers
 
@@ -26,14 +29,72 @@ def test_x_must_be_rows_of_d_numbers(x):
 
 @pytest.mark.parametrize(
     "f",
-    [lambda x: 1.0, lambda x: x[1:, 0], lambda x: None, lambda x: ["far"] * len(x), lambda x: 1j * x[:, 0]],
-    ids=["scalar", "short", "none", "words", "complex"],
+    [
+        lambda x: 1.0,
+        lambda x: x[1:, 0],
+        lambda x: None,
+        lambda x: ["far"] * len(x),
+        lambda x: 1j * x[:, 0],
+        lambda x: x[:, 0] > 1.0,
+        lambda x: [1.0, *(x[1:, 0] > 1.0)],
+        lambda x: torch.from_numpy(x[:, 0]) > 1.0,
+        lambda x: x[:, 0].astype(str),
+        lambda x: (1e3 * x[:, 0]).astype("m8[ms]"),
+    ],
+    ids="scalar short none words complex booleans mixed tensor text times".split(),
 )
 @pytest.mark.parametrize("on_error", ["raise", "bound"])
 def test_f_must_give_one_real_number_per_row(f, on_error):
     """Not an outcome that is missing, but an f that is none: no rule for errors covers it."""
     with pytest.raises(samplers.EvaluationError, match=r"Expected f to return shape \(50,\), one"):
         samplers.estimate(samplers.FunctionProblem(f, 2), "mc", seed=1, max_sim=50, on_error=on_error)
+
+
+def cells(values, missing):
+    """Return values as objects, those that are NaN as another thing that stands for missing."""
+    return [missing if math.isnan(value) else value for value in values.tolist()]
+
+
+MISSING = {
+    "masked": np.ma.masked_invalid,
+    "masked numbers": lambda f: np.ma.array(np.nan_to_num(f, nan=-9999).round(), mask=np.isnan(f), dtype=int),
+    "masked elements": lambda f: cells(f, np.ma.masked),
+    "masked scalars": lambda f: cells(f, np.ma.array(-9999.0, mask=True)),
+    "None": lambda f: cells(f, None),
+    "objects": lambda f: np.array(cells(f, None), dtype=object),
+    "pandas' NA": lambda f: cells(f, pd.NA),
+    "nullable floats": lambda f: pd.Series(cells(f, pd.NA), dtype="Float64"),
+    "nullable integers": lambda f: pd.Series(cells(f.round(), pd.NA), dtype="Int64"),
+    "NaN as an integer": lambda f: torch.tensor(f).round().int(),
+    "tensor with its gradient": lambda f: torch.tensor(f, requires_grad=True),
+}
+
+
+@pytest.mark.parametrize("form", MISSING)
+def test_what_is_masked_or_missing_is_no_outcome(form):
+    """In whole arrays, in terms, and in what either of two problems to be compared gives."""
+
+    def lost(x):
+        return MISSING[form](np.where(x[:, 1] > 1.0, np.nan, 4.0 * (2.0 - x[:, 0])))
+
+    problem = samplers.FunctionProblem(lost, 2)
+    x = problem.base.sample(50, np.random.default_rng(0))
+    np.testing.assert_array_equal(np.isnan(problem.evaluate(x)), x[:, 1] > 1.0)
+    result = samplers.estimate(problem, "mc", seed=0, max_sim=200, on_error="failure")
+    assert result.failures.total >= np.isnan(result.failures.f).sum() > 20
+    with pytest.raises(samplers.EvaluationError, match=r"f failed twice on x = .* f is NaN"):
+        samplers.compare(problem, samplers.FunctionProblem(lambda x: 5.0 - x[:, 0], 2), "mc", seed=0, max_sim=400)
+
+
+def test_masked_terms_are_no_outcome():
+    series = samplers.FunctionProblem(dim=2, terms=lambda x: np.ma.masked_where(x > 1.0, 3.0 - x))
+    result = samplers.estimate(series, "mc", seed=0, max_sim=200, on_error="failure")
+    assert result.failures.total == np.isnan(result.failures.f).sum() > 20
+
+
+def test_a_p_above_a_half_comes_with_the_direction():
+    wrong_way = samplers.FunctionProblem(lambda x: (x[:, 0] > 2.0).astype(int), 2)
+    assert "where large f is, give -f" in samplers.estimate(wrong_way, "mc", seed=0, max_sim=500).remarks[0]
 
 
 def test_a_series_system_is_given_by_its_terms_alone():
