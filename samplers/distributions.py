@@ -128,24 +128,32 @@ def gaussian_of_scipy(frozen: Any) -> Gaussian:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScipyDistribution(DrawnByItsMap):
-    """Independent coordinates with a frozen continuous distribution of `scipy.stats`, k of them for parameters (k,)."""
+    """Independent coordinates with a continuous distribution of `scipy.stats`, k of them for parameters (k,).
+
+    It is a frozen one, or of those with methods `icdf` and `ccdf`, as `scipy.stats.Normal`.
+    """
 
     frozen: Any
 
     def __post_init__(self) -> None:
         """Raise a ValueError for a discrete distribution and for invalid parameters."""
-        from scipy.stats import rv_continuous  # takes a second to import, and whoever has a frozen one has done so
-
-        name = self.frozen.dist.name
-        if not isinstance(self.frozen.dist, rv_continuous):
+        dist = getattr(self.frozen, "dist", self.frozen)
+        name = getattr(dist, "name", type(dist).__name__)
+        if {"rv_discrete", "DiscreteDistribution"} & {kind.__name__ for kind in type(dist).__mro__}:
             raise ValueError(f"Expected a continuous distribution, got the discrete {name} of scipy.stats.")
         if np.ndim(self._median) > 1 or not np.isfinite(self._median).all():
-            given = f"{self.frozen.args} and {self.frozen.kwds}"
+            given = repr(dist) if dist is self.frozen else f"{self.frozen.args} and {self.frozen.kwds}"
+            given = " ".join(given.split())
             raise ValueError(f"Expected valid parameters of {name}, of shape () or (k,), got {given}.")
+
+    def _call(self, name: str, values: Any) -> FloatArray:
+        """Call ppf, isf or sf by the name that it has."""
+        own = name if hasattr(self.frozen, "ppf") else {"ppf": "icdf", "isf": "iccdf", "sf": "ccdf"}[name]
+        return np.asarray(getattr(self.frozen, own)(values), dtype=np.float64)
 
     @cached_property
     def _median(self) -> FloatArray:
-        return np.asarray(self.frozen.ppf(0.5), dtype=np.float64)
+        return self._call("ppf", 0.5)
 
     @property
     def dim(self) -> int:
@@ -158,12 +166,12 @@ class ScipyDistribution(DrawnByItsMap):
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
         """Map x (n, k) to u ~ N(0, I)."""
-        return np.asarray(np.where(x > self._median, -ndtri(self.frozen.sf(x)), ndtri(self.frozen.cdf(x))))
+        return np.asarray(np.where(x > self._median, -ndtri(self._call("sf", x)), ndtri(self.frozen.cdf(x))))
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
         """Map u ~ N(0, I), (n, k), to x."""
         tail = ndtr(-np.abs(u))
-        return np.asarray(np.where(u > 0, self.frozen.isf(tail), self.frozen.ppf(tail)))
+        return np.asarray(np.where(u > 0, self._call("isf", tail), self._call("ppf", tail)))
 
 
 FARTHEST_U = 7.0
@@ -278,9 +286,9 @@ def as_distribution(base: Any, dim: int | None = None) -> Any:
     """Return a base distribution (`samplers.Distribution`) for one of SciPy or OpenTURNS, or for a list of them.
 
     Args:
-        base: A frozen distribution of `scipy.stats` (one coordinate, or k with parameters of shape (k,)), its
-            `multivariate_normal`, a distribution or copula of OpenTURNS, or a list of these, one behind the other and
-            independent. What is a base distribution already is returned as it is.
+        base: A distribution of `scipy.stats` with its parameters (one coordinate, or k with parameters of shape (k,)),
+            its `multivariate_normal`, a distribution or copula of OpenTURNS, or a list of these, one behind the other
+            and independent. What is a base distribution already is returned as it is.
         dim: Number of dimensions wanted: a distribution of one coordinate is then repeated. None takes what base has.
 
     Raises:
@@ -303,9 +311,11 @@ def as_distribution(base: Any, dim: int | None = None) -> Any:
     if found is None:
         # of a user's class
         if isinstance(base, type) or not all(callable(getattr(base, name, None)) for name in METHODS_OF_A_BASE):
+            unfrozen = isinstance(base, type) or type(base).__name__.endswith("_gen")  # those of SciPy
+            hint = ": call it, with its parameters" if unfrozen else ""
             raise ValueError(
-                f"Expected a frozen distribution of scipy.stats such as norm(0, 1), one of OpenTURNS, a list of them, "
-                f"or an object with {', '.join(METHODS_OF_A_BASE)}; got {base!r}."
+                f"Expected a distribution of scipy.stats with its parameters, such as norm(0, 1), one of OpenTURNS, a "
+                f"list of them, or an object with {', '.join(METHODS_OF_A_BASE)}; got {base!r}{hint}."
             )
         found = base
     own = getattr(found, "dim", None)  # a user's distribution need not have it
@@ -319,10 +329,13 @@ def as_distribution(base: Any, dim: int | None = None) -> Any:
 def convert(base: Any) -> Any:
     """Return a distribution of SciPy (discrete ones are refused) or OpenTURNS as a base; None for anything else."""
     library = type(base).__module__
-    if library.startswith("scipy.stats"):
-        if hasattr(base, "cov_object"):
-            return gaussian_of_scipy(base)
-        return ScipyDistribution(base) if hasattr(base, "ppf") and getattr(base, "dist", None) is not None else None
+    if hasattr(base, "freeze") and getattr(base, "numargs", None) == 0:  # of no shape parameters, as a histogram
+        base = base.freeze()
+    if library.startswith("scipy.stats") and hasattr(base, "cov_object"):
+        return gaussian_of_scipy(base)
+    frozen = hasattr(base, "ppf") and getattr(base, "dist", None) is not None
+    if frozen or (all(hasattr(base, name) for name in ("icdf", "iccdf", "logpdf")) and not isinstance(base, type)):
+        return ScipyDistribution(base)
     known = library.startswith("openturns") and hasattr(base, "getIsoProbabilisticTransformation")
     return OpenTurnsDistribution(base) if known else None
 

@@ -6,6 +6,7 @@ import io
 import math
 import reprlib
 import shlex
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -175,7 +176,10 @@ class LoadedStudy:
             return list(file.schema_arrow.names)
 
     def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
-        """Return the table of all simulations, a row each; docs/using_results.md has its columns."""
+        """Return the table of all simulations, a row each; docs/using_results.md has its columns.
+
+        Reading takes about 1.5 times its memory: 1 GB for the 12 columns of 10^7 simulations of car-following.
+        """
         import pyarrow.parquet as pq
 
         path = self.episodes_path
@@ -188,8 +192,8 @@ class LoadedStudy:
         where = None if failed is None else [("failed", "=", failed)]
         with open_parquet(path) as file:
             _check_size(path, file, columns or known)
-            with open_ordinary(path) as opened:
-                return pq.read_table(opened, columns=columns, filters=where)
+            with open_ordinary(path) as opened:  # read ahead, it would take twice the memory
+                return pq.read_table(opened, columns=columns, filters=where, pre_buffer=False)
 
 
 def _check_size(path: Path, file: pyarrow.parquet.ParquetFile, columns: list[str]) -> None:
@@ -211,9 +215,13 @@ def load_finished(folder: Path) -> LoadedStudy:
         raise BadInput(
             f"The run in {str(folder)!r} is not finished: rare-envs resume {shlex.quote(str(folder))} comes first."
         )
-    study = load_study(folder)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        study = load_study(folder)
     with as_bad_input(OSError, ValueError):
-        _ = study.failures  # read here
+        _ = study.failures  # read here: an error stands alone
+    for each in told:
+        warnings.warn(each.message, stacklevel=2)
     return study
 
 
@@ -224,7 +232,8 @@ def load_study(folder: str | Path) -> LoadedStudy:
         folder: Of `rare-envs estimate --out`.
 
     Returns:
-        Its numbers; failures and simulations are read when they are asked for.
+        Its numbers; failures and simulations are read when they are asked for. Files that are not what the run wrote
+        come with a warning, and their names are its `changed_files`.
 
     Raises:
         BadInput: There is no finished run, or a file of it is damaged.
@@ -251,7 +260,15 @@ def load_study(folder: str | Path) -> LoadedStudy:
     numbers = [result.get("p"), *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
     if not all(type(value) in (int, float) and 0.0 <= value < math.inf for value in numbers):
         raise BadInput(f"Expected p and its interval as numbers, 0 or more, in {str(path / RESULT)!r}.")
-    return LoadedStudy(path, about, result)
+    study = LoadedStudy(path, about, result)
+    with as_bad_input(OSError):
+        changed = study.changed_files
+    if changed:
+        warnings.warn(
+            f"Not what the run in {str(folder)!r} wrote, by the digests in its {STUDY}: {', '.join(changed)}.",
+            stacklevel=2,
+        )
+    return study
 
 
 def _read_object(path: Path) -> dict[str, Any]:

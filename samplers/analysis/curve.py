@@ -13,7 +13,6 @@ from samplers.analysis.weighted import (
     add_unresolved,
     cov_inflation,
     leave_out_lost,
-    no_outcome_weight,
     require_sample,
     simultaneous_intervals,
     unit_sums,
@@ -152,9 +151,9 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     inflation = cov_inflation(estimate, float(sums.cov[at_gamma]))
     cov = np.where(sums.is_count, 1.0, inflation) * sums.cov
     low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
-    if lost := no_outcome_weight(estimate, sample):
+    if estimate.on_error == "bound" and np.isneginf(sample.f).any():
         known = unit_sums(leave_out_lost(sample), grid)
-        p_known = p * (1 - lost / np.maximum(sums.p, lost))
+        p_known = p * known.p / np.maximum(sums.p, np.finfo(np.float64).tiny)
         seen = use[p_known[use] > 0]
         low, _ = simultaneous_intervals(known, seen, p_known, inflation * known.cov, estimate.confidence, estimate.seed)
     low[use] = np.maximum.accumulate(low[use])

@@ -74,11 +74,6 @@ def cov_inflation(estimate: Outcome, own_cov: float) -> float:
     return max(1.0, estimate.cov / own_cov)
 
 
-def no_outcome_weight(estimate: EstimateData, sample: Sample) -> float:
-    """Return the weight of points without an outcome if they do not count in the lower end ("bound"); else 0."""
-    return float(sample.weights[np.isneginf(sample.f)].sum()) if estimate.on_error == "bound" else 0.0
-
-
 def add_unresolved(
     estimate: EstimateData, thresholds: FloatArray, p: FloatArray, high: FloatArray, new_base: Any = None
 ) -> FloatArray:
@@ -220,11 +215,13 @@ def leave_out_lost(sample: Sample) -> Sample:
 def estimate_known(found: Outcome, gamma: float, confidence: float) -> tuple[float, float, float]:
     """Return p > 0 of the failures that have an outcome, its c.o.v. and the lower end, from these points alone.
 
-    Without weighted points all three are those of p, in proportion.
+    Without weighted points they are p in proportion, which is then as if that share of 1 / cov^2 failures were met.
     """
     if found.sample is None:
         known = 1 - found.no_outcome_share
-        return found.p * known, found.cov, found.interval[0] * known
+        cov = found.cov / math.sqrt(known) if known > 0 else math.inf
+        low = log_normal_interval(found.p * known, cov, confidence)[0] if cov < math.inf else 0.0
+        return found.p * known, cov, min(low, found.interval[0] * known)
     grid = np.array([gamma])
     whole, sums = (unit_sums(each, grid) for each in (found.sample, leave_out_lost(found.sample)))
     p, cov = found.p * float(sums.p[0] / whole.p[0]), cov_inflation(found, float(whole.cov[0])) * float(sums.cov[0])

@@ -10,9 +10,10 @@ import samplers
 from samplers.distributions import OpenTurnsDistribution, ScipyDistribution, as_distribution
 
 
-@pytest.mark.parametrize("base", ["us101", stats.norm, samplers.StandardNormal, [], [1.0], 3.0])
+@pytest.mark.parametrize("base", ["us101", samplers.StandardNormal, stats.Normal, stats.gamma, [], [1.0], 3.0])
 def test_other_things_are_refused(base):
-    with pytest.raises(ValueError, match=r"Expected a frozen distribution of scipy\.stats"):
+    hint = ": call it, with its parameters" if base in (samplers.StandardNormal, stats.Normal, stats.gamma) else ""
+    with pytest.raises(ValueError, match=rf"Expected a distribution of scipy\.stats with its parameters.*{hint}\.$"):
         as_distribution(base)
 
 
@@ -28,6 +29,30 @@ def test_lists_are_independent_in_their_order():
     x = base.sample(4, np.random.default_rng(0))
     assert ((x[:, 0] > 5.0) & (x[:, 0] < 6.0)).all()
     np.testing.assert_allclose(base.log_prob(x), stats.multivariate_normal([1.0, 2.0]).logpdf(x[:, 1:]))
+
+
+BINS = stats.rv_histogram((np.array([1, 3, 0, 4]), np.arange(5.0)))
+
+
+@pytest.mark.parametrize(
+    ("base", "frozen"),
+    [
+        (stats.norm, stats.norm()),
+        (BINS, BINS()),
+        (stats.Normal(mu=[1.0, 2.0], sigma=3.0), stats.norm([1.0, 2.0], 3.0)),
+        (stats.make_distribution(stats.gamma)(a=2.0), stats.gamma(2.0)),
+        (stats.truncate(stats.Normal(), lb=-1.0, ub=3.0), stats.truncnorm(-1.0, 3.0)),
+    ],
+    ids=["without parameters", "histogram", "Normal", "made", "truncated"],
+)
+def test_forms_of_scipy_are_those_that_are_frozen(base, frozen):
+    one, other = as_distribution(base), ScipyDistribution(frozen)
+    u = np.linspace(-6.0, 6.0, 5)[:, None] * np.ones(other.dim)
+    x = one.from_standard_normal(u)
+    np.testing.assert_allclose(x, other.from_standard_normal(u), rtol=1e-9)
+    np.testing.assert_allclose(one.log_prob(x[1:4]), other.log_prob(x[1:4]), rtol=1e-9)
+    with pytest.raises(ValueError, match="got the discrete Binomial"):
+        as_distribution(stats.Binomial(n=3, p=0.5))
 
 
 ONE = [stats.norm(3, 2), stats.lognorm(0.5), stats.gumbel_r(1, 2), stats.beta(2, 5), stats.t(3), stats.expon(scale=4)]

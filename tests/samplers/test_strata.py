@@ -322,10 +322,16 @@ def test_the_lower_end_of_failures_with_an_outcome_keeps_its_level(whole):
     assert np.sum(np.array(lows) > 0.05) <= 5  # by chance more in 1 of 200
 
 
-def test_the_lower_end_of_weighted_failures_with_an_outcome_keeps_its_level():
+SLOW = pytest.mark.slow
+RUNS = [("ce", 1), pytest.param("ce", 3, marks=SLOW), pytest.param("adss", 1, marks=SLOW)]
+
+
+@pytest.mark.parametrize(("method", "replicates"), RUNS)
+def test_the_lower_end_of_weighted_failures_with_an_outcome_keeps_its_level(method, replicates):
     """0.05 have no outcome, 9.5e-4 fail with one: so few of the draws that the error of p says nothing about theirs."""
     problem = FunctionProblem(lambda x: np.where(x[:, 1] > 1.6449, np.nan, 3.0902 - x[:, 0]), 2)
-    runs = [samplers.estimate(problem, "ce", seed=seed, max_sim=2000, on_error="bound") for seed in range(60)]
+    asked = {"max_sim": 2000 * replicates, "replicates": replicates, "on_error": "bound"}
+    runs = [samplers.estimate(problem, method, seed=seed, **asked) for seed in range(60)]
     assert sum(run.interval[0] > 9.5e-4 for run in runs) <= 5
     assert np.mean([run.interval[0] > 0 for run in runs]) > 0.3
 

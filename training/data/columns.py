@@ -5,13 +5,15 @@ Errors name the file and the line, counted from 1 as editors do.
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import IO, Any, Literal, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +29,10 @@ CHUNK, LARGEST_DOCUMENT = 1 << 24, 1 << 28
 """Characters of JSON read at a time (documents have 1e4 to 1e6), and after which one that does not end is broken."""
 LONGEST_LINE = 2**16
 """Characters of a line."""
+GZIP, DELIMITERS = b"\x1f\x8b", (",", ";", "\t")
+"""First bytes of a gzipped file, and what may stand between columns."""
+BLANK = ' \t\r\n,;"\x1a'
+"""What lines may hold that hold nothing, as spreadsheets and old editors leave them at the end."""
 FASTEST_SPEED = 70.0
 """Speed [m/s] above which (252 km/h) units are taken to be wrong, or tracking to be broken."""
 FASTEST_JUMP = 100.0
@@ -97,22 +103,39 @@ class Rows:
         self.refuse(~(np.isfinite(values) | empty), lambda row: f"{header} is {values[row]:g}, a number was expected.")
 
 
-def read_header(path: Path) -> list[str]:
-    """Return the fields of the first line; a ValueError if the file cannot be read or is empty."""
+def _open_table(path: Path) -> IO[bytes]:
+    """Open a file of text, which may be gzipped whatever its name."""
+    with open_ordinary(path) as file:
+        packed = file.read(len(GZIP)) == GZIP
+    return cast(IO[bytes], gzip.open(path)) if packed else open_ordinary(path)
+
+
+def read_header(path: Path) -> tuple[list[str], str]:
+    """Return the fields of the first line and their delimiter; a ValueError if there are none to be read."""
     try:
-        header = [name.strip().strip('"') for name in next(_lines(path), "").split(",")]
+        line = next(_lines(path), "")
     except UnicodeDecodeError:
-        raise ValueError(f"Cannot read {path}: it is no text, and CSV or text was expected.") from None
-    except (OSError, ValueError) as error:
+        raise ValueError(f"Cannot read {path}: it is no text; expected CSV or text, or either by gzip.") from None
+    except (OSError, EOFError, zlib.error, ValueError) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
-    if header == [""]:
+    if not line.strip():
         raise ValueError(f"{path} is empty.")
-    return header
+    delimiter = max(DELIMITERS, key=line.count)
+    return [name.strip().strip('"') for name in line.split(delimiter)], delimiter
+
+
+def has_names(header: Sequence[str]) -> bool:
+    """Return whether the fields of a first line are names, not all numbers; a field may be empty."""
+    try:
+        np.array(" ".join(header).split(), dtype=np.float64)
+    except ValueError:
+        return True
+    return False
 
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines of a text of bounded length, whatever stands in the place of the file."""
-    with io.TextIOWrapper(open_ordinary(path), encoding="utf-8-sig") as file:
+    with io.TextIOWrapper(_open_table(path), encoding="utf-8-sig") as file:
         while line := file.readline(LONGEST_LINE):
             if len(line) == LONGEST_LINE:
                 raise ValueError(f"a line has {LONGEST_LINE:,} letters or more.")
@@ -121,23 +144,23 @@ def _lines(path: Path) -> Iterator[str]:
 
 def read_table(path: Path, columns: ColumnMap, leave_out_empty: bool = False) -> Rows:
     """Return columns of a CSV file in the units of the table, on request without rows in which a number is missing."""
-    header = read_header(path)
+    header, delimiter = read_header(path)
     known = {name.lower(): f"c{i}" for i, name in enumerate(header)}
     found = {name: [known[also.lower()] for also in c.names if also.lower() in known] for name, c in columns.items()}
     if missing := [columns[name].names[0] for name, at in found.items() if not (at or columns[name].optional)]:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header)}.")
     columns = {name: columns[name] for name, at in found.items() if at}
     places = {name: found[name][0] for name in columns}
-    table = _read_csv(path, len(header), {places[name]: column for name, column in columns.items()})
-    if not table.num_rows:
+    table = _read_csv(path, len(header), delimiter, {places[name]: column for name, column in columns.items()})
+    numbers = {name: column for name, column in columns.items() if not column.text}
+    unknown = np.array([table[places[name]].is_null().to_numpy() for name in numbers], dtype=bool)
+    blank = np.asarray(unknown.all(axis=0))  # a line without a number, such as the last one
+    if blank.all():
         raise ValueError(f"{path} has a header and no rows.")
     rows = Rows(path, {name: table[place].to_numpy() for name, place in places.items()}, 2 + np.arange(table.num_rows))
-    given = np.ones(len(rows), dtype=bool)
-    for name, column in columns.items():
-        if column.text:
-            continue
-        empty = np.asarray(table[places[name]].is_null().to_numpy(), dtype=bool)
-        given &= ~empty
+    rows, unknown = rows.select(~blank), unknown[:, ~blank]
+    given = np.asarray(~unknown.any(axis=0))
+    for (name, column), empty in zip(numbers.items(), unknown, strict=True):
         if not leave_out_empty:
             rows.refuse(empty, f"{column.names[0]} is empty, a number was expected.")
         rows.refuse_infinite(name, column.names[0], empty)
@@ -146,13 +169,21 @@ def read_table(path: Path, columns: ColumnMap, leave_out_empty: bool = False) ->
     return (rows if given.all() else rows.select(given)).convert(columns)
 
 
-def _read_csv(path: Path, size: int, columns: ColumnMap) -> pa.Table:
+def _read_csv(path: Path, size: int, delimiter: str, columns: ColumnMap) -> pa.Table:
     """Return columns named c0, c1, ... by their places in a file behind its header; errors give them their names."""
     types = {place: pa.string() if column.text else pa.float64() for place, column in columns.items()}
     reading = csv.ReadOptions(column_names=[f"c{i}" for i in range(size)], skip_rows=1, use_threads=False)
     converting = csv.ConvertOptions(include_columns=sorted(types), column_types=types, strings_can_be_null=False)
+    parsing = csv.ParseOptions(
+        delimiter=delimiter,
+        ignore_empty_lines=False,
+        invalid_row_handler=lambda row: "error" if row.text.strip(BLANK) else "skip",
+    )
     try:
-        return csv.read_csv(path, reading, csv.ParseOptions(ignore_empty_lines=False), converting)
+        with _open_table(path) as file:
+            return csv.read_csv(file, reading, parsing, converting)
+    except (OSError, EOFError, zlib.error) as error:
+        raise ValueError(f"Cannot read {path}: {error}") from None
     except pa.ArrowInvalid as error:
         found = re.search(r"column #(\d+): Row #(\d+): .* invalid value '(.*)'", str(error), re.DOTALL)
         if found is None:
@@ -164,10 +195,10 @@ def _read_csv(path: Path, size: int, columns: ColumnMap) -> pa.Table:
 def read_matrix(path: Path, columns: ColumnMap, matrix: FloatArray | None = None, size: int = 18) -> Rows:
     """Return columns, by their places, of a matrix (rows, size), or of text that holds one."""
     if matrix is None:
-        delimiter = "," if len(read_header(path)) > 1 else None
+        header, delimiter = read_header(path)
         try:
-            matrix = np.loadtxt(_lines(path), ndmin=2, delimiter=delimiter)
-        except (OSError, ValueError) as error:
+            matrix = np.loadtxt(_lines(path), ndmin=2, delimiter=delimiter if len(header) > 1 else None)
+        except (OSError, EOFError, zlib.error, ValueError) as error:
             raise ValueError(f"Cannot read {path}: {error}") from None
     if matrix.shape[1] != size:
         raise ValueError(f"{path} has no header and {matrix.shape[1]} columns; expected the {size} of NGSIM.")
@@ -213,7 +244,7 @@ def _documents(path: Path) -> Iterator[Mapping[str, Any]]:
     """Yield the objects of a JSON array one by one, without holding the file in memory."""
     decoder, place = json.JSONDecoder(), 1
     try:
-        with io.TextIOWrapper(open_ordinary(path), encoding="utf-8") as file:
+        with io.TextIOWrapper(_open_table(path), encoding="utf-8") as file:
             text = file.read(CHUNK).lstrip()
             if not text.startswith("["):
                 raise ValueError(f"{path} is no JSON array; expected a file of I-24 MOTION, unpacked.")

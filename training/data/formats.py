@@ -26,6 +26,7 @@ from training.data.columns import (
     check_clock,
     check_lengths,
     check_tracks,
+    has_names,
     read_documents,
     read_header,
     read_matrix,
@@ -51,6 +52,8 @@ NGSIM = {
 }
 """Positions are those of the front centre, across from the left edge; lane 1 is the leftmost. U.S. Department of
 Transportation, record 8ect-6jqj."""
+NGSIM_ROUNDED = 1e5
+"""Times that are all multiples of this [ms] have lost digits."""
 NGSIM_STEP, NGSIM_PAUSE, RENUMBER_OFFSET = 100.0, 60_000.0, 1_000_000
 """Time between frames, and that after which a number that comes back belongs to another vehicle, because each 15
 minutes were numbered anew [ms]; the number is then raised, once for each time that it comes back."""
@@ -172,7 +175,7 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
 
     Args:
         path: CSV with the published header (the order of columns does not matter, others are ignored), or text with the
-            18 published columns and no header, separated by blanks or commas.
+            18 published columns and no header, separated by blanks or commas; either may be gzipped.
         location: Which of the file's locations to read, such as "us-101", where it has several.
         gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
 
@@ -191,15 +194,20 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
         [15.24, 15.24, 15.24]
     """
     path = Path(path)
-    has_header = any(character.isalpha() for character in read_header(path)[0])
-    rows = (read_table if has_header else read_matrix)(path, NGSIM)
+    rows = (read_table if has_names(read_header(path)[0]) else read_matrix)(path, NGSIM)
     places = np.unique(rows.columns.get("location", np.empty(0, np.str_))).tolist()
     if location not in (places if location or len(places) > 1 else (location,)):
         known = ", ".join(places) or "of no column Location"
         raise ValueError(f"{path} has the locations {known}; choose one with location=, not {location}.")
-    recording = location or next(iter(places), path.stem)
+    recording = location or next(iter(places), Path(path.name.removesuffix(".gz")).stem)
     rows = rows.select(rows["location"] == recording) if places else rows
     frame = np.rint(rows["time"] / NGSIM_STEP)
+    twice = len(np.unique(np.stack([rows["vehicle"], frame]), axis=1).T) < len(rows)
+    rows.refuse(
+        twice and not np.any(rows["time"] % NGSIM_ROUNDED),
+        f"Global_Time is {rows['time'][0]:.3g} and in steps of 100 s: a spreadsheet has rounded it. Take the file as "
+        "it was published, or save it with all digits of this column.",
+    )
     check_lengths(rows, "feet")
     vehicle, leader = _renumber(rows["vehicle"], rows["leader"], frame)
     check_tracks(rows, vehicle, frame, rows["x"], rows["speed"], NGSIM_STEP / 1000.0, gaps)
@@ -420,7 +428,7 @@ def load_tgsim(path: Path | str, *, gaps: Gaps = "error") -> Trajectories:
         ('I294-1-right', [-1.8, 1.8])
     """
     path = Path(path)
-    if {name.lower() for name in read_header(path)} & TGSIM_STREETS:
+    if {name.lower() for name in read_header(path)[0]} & TGSIM_STREETS:
         raise ValueError(f"{path} is of streets (speed_kf_x); only TGSIM's files of motorways are read.")
     rows = read_table(path, TGSIM, leave_out_empty=gaps == "cut")
     check_lengths(rows, "metres")

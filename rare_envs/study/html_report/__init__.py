@@ -7,6 +7,7 @@ import contextlib
 import io
 import re
 import shlex
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -207,7 +208,9 @@ def write_html_report(
     """
     if figures is not None and figures not in drawings.FORMATS:
         raise BadInput(f"Expected --figures {', '.join(drawings.FORMATS)}, got {figures!r}.")
-    study, page = load_finished(folder), out or folder / REPORT
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # files that changed, which the page names
+        study, page = load_finished(folder), out or folder / REPORT
     with output_folder(page.parent, page.name, folders=() if figures is None else ("figures",)):
         question = open_run(study, trust)
         warn_of_changed_files(question, folder)

@@ -65,6 +65,7 @@ def test_unknown_measures_are_refused() -> None:
         (lambda moment: moment.state.speed, "shape"),
         (lambda moment: moment.lead.gap.mean(), "shape"),
         (lambda moment: 1.0, "got 1.0"),
+        (lambda moment: moment.lead.gap < 1.0, "small where it is dangerous, got .*bool"),
         (lambda moment: moment.lead.gap * math.nan, "finite"),
         (lambda moment: moment.lead.headway, "headway"),
         (TraceMeasure(lambda trace: trace.lead.gap), "shape"),

@@ -79,8 +79,10 @@ def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:
 def test_a_run_with_a_damaged_parameter_is_refused(run: Path) -> None:
     table = (run / "failures.csv").read_text()
     (run / "failures.csv").write_text(table.replace(table.splitlines()[1].split(",")[0], "nan"))
+    with pytest.warns(UserWarning, match=r"failures\.csv"):
+        study = load_finished(run)
     with pytest.raises(BadInput, match="no number"):
-        list_failures(load_finished(run))
+        list_failures(study)
 
 
 def test_trials_in_their_order(tmp_path: Path) -> None:

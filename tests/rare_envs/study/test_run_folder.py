@@ -39,7 +39,13 @@ def test_what_is_not_what_the_run_wrote_is_named(finished_run: Path, tmp_path: P
     (run / "failures.csv").write_bytes(content)
     (run / "episodes.parquet").unlink()
     (run / "report.html").touch()
-    assert rare_envs.load_study(run).changed_files == ["failures.csv", "episodes.parquet"]
+    with pytest.warns(UserWarning, match=r"Not what the run in .* wrote, .*: failures\.csv, episodes\.parquet\."):
+        study = rare_envs.load_study(run)
+    assert study.changed_files == ["failures.csv", "episodes.parquet"]
+    result = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    (run / "result.json").write_text(json.dumps({**result, "p": 1e-9}), encoding="utf-8")
+    with pytest.warns(UserWarning, match=r"result\.json, failures\.csv, episodes"):
+        assert rare_envs.load_study(run).p == 1e-9
     (run / "study.json").unlink()
     assert rare_envs.load_study(run).changed_files == []
 

@@ -1,5 +1,6 @@
 """Files of the five formats, there and back: values in the frame of the road, and what is refused, with its line."""
 
+import gzip
 import json
 
 import numpy as np
@@ -88,6 +89,33 @@ def test_ngsim(traffic, ngsim, tmp_path):
     write_csv(other, [{"O_Zone": "", **{k.replace("v_Len", "v_len"): row[k] for k in reversed(row)}} for row in rows])
     plain.write_text("\n".join("  ".join(str(value) for value in row.values()) for row in rows), encoding="utf-8")
     assert same(load_ngsim(other), table) and same(load_ngsim(plain), table)
+
+
+def test_ngsim_as_other_programs_save_it_is_the_same_table(ngsim, tmp_path):
+    """With an index of pandas or blank lines at the end, gzipped, or by a spreadsheet; rounded times are refused."""
+    path, rows = tmp_path / "road.csv", [row for row in ngsim[1] if row["Vehicle_ID"] <= 2][:60]
+    text = write_csv(path, rows).read_text(encoding="utf-8")
+    first, *others = text.splitlines()
+    indexed = "\n".join([f",{first}", *(f"{k},{row}" for k, row in enumerate(others))])
+    table = load_ngsim(path)
+    for content in (
+        indexed.encode(),
+        f"{text}\n \n".encode(),
+        f"{text}{',' * first.count(',')}\n,,\n".encode(),
+        gzip.compress(indexed.encode()),
+        b"\xef\xbb\xbf" + text.replace(",", ";").encode(),
+        text.replace(",", "\t").encode(),
+        "\n".join(others).replace(",0.0,", ",0E+00,").encode(),
+        gzip.compress("\n".join([*others, "", ""]).encode()),
+    ):
+        path.write_bytes(content)
+        assert same(load_ngsim(path), table), content[:200]
+    write_csv(path, [{**row, "Global_Time": 1.1e12} for row in rows])
+    with pytest.raises(ValueError, match=r"road\.csv, line 2: Global_Time is 1\.1e\+12 .*a spreadsheet has rounded it"):
+        load_ngsim(path)
+    path.write_bytes(gzip.compress(text.encode())[:-20])
+    with pytest.raises(ValueError, match="Cannot read"):
+        load_ngsim(path)
 
 
 def test_locations_are_chosen_and_numbers_given_again_are_told_apart(ngsim, tmp_path):
