@@ -33,7 +33,6 @@ from rare_envs.measures.base import COLLISION
 from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.plugins import check_name
 from rare_envs.scenarios.registry import HIGHWAY_ENV_IDS
-from samplers.problem import read_numbers
 
 TTC_MIN = 0.01
 """They are at least this [s], so that only a collision comes to 0 or less."""
@@ -285,10 +284,11 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         road.step = step_and_measure
 
     def _measure_now(self) -> float:
-        value = float(read_numbers(self._measure(self.scene), f"a number from the measure {self._measure!r}"))
-        if math.isnan(value):
-            raise ValueError(f"The measure {self._measure!r} gave NaN; expected a number that is small in danger.")
-        return value
+        value = self._measure(self.scene)
+        if isinstance(value, bool | np.bool_) or math.isnan(value):
+            gave = value if isinstance(value, bool | np.bool_) else "NaN"
+            raise ValueError(f"The measure {self._measure!r} gave {gave}; expected a number that is small in danger.")
+        return float(value)
 
     def _info(self) -> dict[str, Any]:
         crashed = bool(self.scene.vehicle.crashed)
