@@ -104,7 +104,7 @@ class _RenamingUnpickler(pickle.Unpickler):
 
 MAX_AXES, MAX_SIZE = 8, 2**31
 """Most axes of an array, and the largest size of one."""
-MAX_STEPS = 500_000
+MAX_STEPS = 100_000
 """Instructions of a pickle, each of which may make an object; that of a policy has some thousand."""
 
 

@@ -31,7 +31,7 @@ HUB_PREFIX = "hf:"
 _HUB_NAME = re.compile(r"hf:([\w-][\w.-]*)/([\w-][\w.-]*)(?:/([\w-][\w.-]*\.zip))?(?:@([\w-][\w.-]*))?")
 _NOT_MODELS = ("train_eval_metrics.zip", "replay.zip")
 """Files that RL Zoo puts beside a model."""
-_MAX_STATISTICS = 2**26
+_MAX_STATISTICS = 2**25
 """Largest file of statistics [bytes]."""
 _NAMES = ("vecnormalize", "vec_normalize")
 """Names of files of statistics: Stable-Baselines3's callbacks and RL Zoo write the first, its examples the second."""

@@ -59,7 +59,7 @@ MAX_OBSERVED = 2**22
 """Most numbers of an observation, and most actions to choose from."""
 _SPARE = 1_000, 2**20
 """Parameters, and numbers in them, that building a policy may take beside twice those in the file."""
-_MAX_NOTES = 2**20
+_MAX_NOTES = 2**18
 """Bytes of the pickle that names the tensors in a member: some 100 for each, and each byte may become 60."""
 _PER_BYTE = 8
 """Bytes of tensors for each byte of a member, which tensors may share."""

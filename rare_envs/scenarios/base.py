@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -268,7 +269,7 @@ def _read(scenario: str, names: tuple[str, ...], source: str, data: Mapping[str,
     if data.get("names") != list(names):
         raise ValueError(
             f"Base distribution {source} does not fit {scenario}: "
-            f"expected names {list(names)} in this order, got {data.get('names')}."
+            f"expected names {list(names)} in this order, got {reprlib.repr(data.get('names'))}."
         )
     try:
         fitted = any(key in data for key in FITTED_KEYS)

@@ -341,7 +341,7 @@ def check_types(known: Mapping[str, Field[Any]], values: Mapping[str, Any], wher
             raise BadInput(f"Expected {name}{where} to be {wanted}, got {reprlib.repr(value)}.")
 
 
-MAX_QUESTION_BYTES = 2**15
+MAX_QUESTION_BYTES = 2**14
 """YAML is read at 40 kB/s."""
 NOT_IN_FILES = ("trust",)
 """Whoever asks decides whether code runs, not a file."""

@@ -36,8 +36,8 @@ from training import Retraining
 
 STORED_FORMAT = 1
 """Number of the format."""
-MAX_STORED, MAX_CORPUS_FILES = 2**26, 100_000
-"""Bytes of a file that are read at most (400,000 values take 10 MB), and files of a corpus."""
+MAX_CORPUS_FILES = 100_000
+"""Files of a corpus that are read."""
 MAX_WORD = 300
 """Letters of a word that is shown."""
 WORLD_FIELDS = ("measure", "gamma", "noise", "drivers", "horizon", "collisions", "weather")
@@ -139,7 +139,7 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
     found = []
     with as_bad_input(ValueError, OSError):
         for path in paths:
-            found.append(parse_stored(read_text_file(path, MAX_STORED), repr(str(path))))
+            found.append(parse_stored(read_text_file(path), repr(str(path))))
     return found
 
 

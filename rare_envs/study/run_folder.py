@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 import reprlib
@@ -16,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.files import (
+    MAX_VALUES,
     digest_file,
     open_ordinary,
     open_parquet,
     parse_json_object,
     read_members,
-    read_rows,
     read_text_file,
 )
 from rare_envs.plugins import one_line
@@ -53,6 +54,8 @@ CRASH = tuple(
     "injury_risk_striking injury_risk_struck".split()
 )
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
+MAX_TABLE_RATIO = 50
+"""Largest ratio of the bytes of columns to those of their file, in which parameters take as many as they have."""
 MAX_TABLE_BYTES = 2**32
 """Largest table that is read at once [bytes]: 40 million simulations with twelve numbers each."""
 
@@ -86,7 +89,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     """
     try:
         failures = _read_table(folder / FAILURES)
-    except ValueError as error:
+    except (csv.Error, ValueError) as error:
         raise ValueError(f"{str(folder / FAILURES)!r} is damaged: {str(error).rstrip('.')}.") from error
     if (folder / BLOCKS).exists():
         failures |= _read_blocks(folder / BLOCKS)
@@ -98,7 +101,10 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
 def _read_table(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns of a table by name."""
-    header, *rows = read_rows(path) or [[]]
+    text = read_text_file(path)
+    if text.count(",") + text.count("\n") > MAX_VALUES:
+        raise ValueError(f"it has more than {MAX_VALUES:,} cells")
+    header, *rows = csv.reader(io.StringIO(text, newline="")) or [[]]
     if any(len(row) != len(header) for row in rows):
         raise ValueError("a row has more or fewer cells than the header")
     columns: dict[str, list[NDArray[Any]]] = {}
@@ -112,14 +118,15 @@ def _read_table(path: Path) -> dict[str, NDArray[Any]]:
 
 def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
     """Return the large blocks by name, shape (n, size)."""
+    members = read_members(path)
     try:
         found = {
             name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-            for name, content in read_members(path).items()
+            for name, content in members.items()
         }
         if any(block.dtype.kind != "f" or block.ndim != 2 for block in found.values()):
             raise ValueError("a block is no table of numbers")
-    except Exception as error:  # the zip, its compression and NumPy's headers have errors of their own
+    except Exception as error:  # NumPy's headers have errors of their own
         raise ValueError(f"{str(path)!r} is damaged: {one_line(error)}.") from error
     return {name: block.astype(np.float64) for name, block in found.items()}
 
@@ -201,6 +208,8 @@ def _check_size(path: Path, file: pyarrow.parquet.ParquetFile, columns: list[str
     about, schema = file.metadata, file.schema_arrow
     n_rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
     n_bytes = 8 * n_rows * sum(int(getattr(schema.field(name).type, "list_size", 1)) for name in columns)
+    if n_bytes > max(2**26, MAX_TABLE_RATIO * path.stat().st_size):
+        raise ValueError(f"{EPISODES} is damaged: {n_rows:,} rows do not fit into it.")
     if n_bytes > MAX_TABLE_BYTES:
         raise ValueError(
             f"{len(columns)} columns of {EPISODES} take {n_bytes / 2**30:,.1f} GiB, more than the "

@@ -31,6 +31,8 @@ DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
 GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
 """Exit codes of a comparison of p with a limit."""
+LONGEST_LINE = 4_000
+"""Characters of an error or a warning: files and names may bring along any number."""
 WHOLE = 1_000
 """Characters of a summary in a list of commands: more than any has."""
 _SIGPIPE = int(getattr(signal, "SIGPIPE", 13))
@@ -194,7 +196,7 @@ def one_line_warnings() -> Iterator[None]:
 def print_stderr(line: str) -> None:
     """Print a line on standard error, if there still is anybody to read it."""
     with contextlib.suppress(OSError, ValueError):
-        print(clean_text(line), file=sys.stderr, flush=True)
+        print(clean_text(line[:LONGEST_LINE]), file=sys.stderr, flush=True)
 
 
 def _fail(message: str) -> NoReturn:

@@ -17,9 +17,10 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.spatial import KDTree
 
 from rare_envs.envs.rendering import CRASH_COLOUR, FRAME_WIDTH, ROLE_COLOURS
-from rare_envs.files import read_rows, replace_text
+from rare_envs.files import replace_text
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import plots, text
@@ -32,6 +33,7 @@ from rare_envs.study.replay import Drive, drive_again, name_parties, read_row
 from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_finished
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
+from training.fit.filters import read_csv_columns
 
 __all__ = ["write_html_report"]
 
@@ -54,18 +56,9 @@ class NearestEvent(NamedTuple):
 
 def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
     """Read events from a CSV file with a column for each of some parameters; others are not looked at."""
-    try:
-        header, *rows = read_rows(path) or [[]]
-        missing = [name for name in names if name not in header]
-        if missing or not rows:
-            has = f"it has {', '.join(header)}" if rows else "it has no rows"
-            raise ValueError(f"expected columns named as the parameters, {', '.join(names)}; {has}")
-        places = [header.index(name) for name in names]
-        values = np.array([[float(row[place] or "nan") for place in places] for row in rows])
-    except OSError as error:
-        raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
-    except (ValueError, IndexError) as error:
-        raise BadInput(f"{str(path)!r} is no table of events: {str(error).rstrip('.')}.") from error
+    with as_bad_input(ValueError):
+        columns = [np.asarray(each, dtype=np.float64) for each in read_csv_columns(path, names).values()]
+    values = np.column_stack(columns)
     known: FloatArray = values[np.isfinite(values).all(axis=1)]
     if not len(known):
         raise BadInput(f"{str(path)!r} has no event with all of {', '.join(names)}.")
@@ -74,19 +67,11 @@ def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
 
 def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) -> NearestEvent:
     """Return the event nearest to a failure x (k,), among events (n, k), beside ordinary scenarios (m, k)."""
-    spread = np.maximum(ordinary.std(axis=0), 1e-12)
-    distances = _distances(x[None], events, spread)[0]
-    nearest = int(distances.argmin())
-    usual = _distances(ordinary, events, spread).min(axis=1)
-    return NearestEvent(float(distances[nearest]), float((usual >= distances[nearest]).mean()), events[nearest])
-
-
-def _distances(x: FloatArray, events: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return distances of x (m, k) to events (n, k), shape (m, n)."""
-    squares = sum(
-        ((x[:, None, j] - events[None, :, j]) / spread[j]) ** 2 for j in range(x.shape[1])
-    )  # parameter by parameter, for memory
-    return np.asarray(np.sqrt(squares / x.shape[1]))
+    spread, root = np.maximum(ordinary.std(axis=0), 1e-12), np.sqrt(len(x))
+    tree = KDTree(events / spread)
+    distance, nearest = tree.query(x / spread)
+    usual, _ = tree.query(ordinary / spread)
+    return NearestEvent(float(distance / root), float((usual >= distance).mean()), events[nearest])
 
 
 MOST_MODES = 8

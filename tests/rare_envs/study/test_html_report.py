@@ -134,9 +134,9 @@ def test_the_nearest_event_is_the_nearest_in_deviations() -> None:
 
 def test_files_without_such_events_are_refused(tmp_path: Path) -> None:
     for text, message in (
-        ("", "columns named as the parameters, a, gap; it has no rows"),
-        ("gap\n1\n", "columns named as the parameters, a, gap; it has gap"),
-        ("a,gap\nx,1\n", "no table"),
+        ("", "Empty CSV file"),
+        ("gap\n1\n", "lacks the columns a"),
+        ("a,gap\nx,1\n", "could not convert string to float: 'x'"),
         ("a,gap\n,1\n", "no event"),
     ):
         (tmp_path / "events.csv").write_text(text)
