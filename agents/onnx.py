@@ -7,6 +7,7 @@ squashed or clipped action and a recurrent policy's memory are part of the graph
 from __future__ import annotations
 
 import json
+import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -27,6 +28,8 @@ from rare_envs.files import open_ordinary, replace_file
 from rare_envs.plugins import one_line
 from rare_envs.startup import advise_install
 
+_MOST_ENTRIES = 2**24
+"""Numbers of an input, of one row or of as many as the file fixes."""
 METADATA_KEY = "rare_envs"
 """Entry of a file's metadata in which `export_onnx` describes observations and actions."""
 _TYPES = {
@@ -198,7 +201,8 @@ def _find_batch_axis(port: Any, batch: Any, path: Path) -> int:
         free = [axis for axis, size in enumerate(port.shape[:2]) if size == (batch if isinstance(batch, int) else 1)][
             :1
         ]
-    if port.type not in _TYPES or len(port.shape) < 2 or len(free) != 1:
+    entries = math.prod(size for size in port.shape if isinstance(size, int))
+    if port.type not in _TYPES or len(port.shape) < 2 or len(free) != 1 or entries > _MOST_ENTRIES:
         raise ValueError(
             f"Expected input {port.name!r} of {str(path)!r} to be numbers of shape (batch, fixed sizes), got "
             f"{port.type} {port.shape}."

@@ -68,6 +68,7 @@ def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
 def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) -> NearestEvent:
     """Return the event nearest to a failure x (k,), among events (n, k), beside ordinary scenarios (m, k)."""
     spread, root = np.maximum(ordinary.std(axis=0), 1e-12), np.sqrt(len(x))
+    events = np.unique(events, axis=0)  # equal ones would all be in one leaf of the tree
     tree = KDTree(events / spread)
     distance, nearest = tree.query(x / spread)
     usual, _ = tree.query(ordinary / spread)
