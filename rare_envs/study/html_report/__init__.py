@@ -72,7 +72,7 @@ def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) 
     tree = KDTree(events / spread)
     distance, nearest = tree.query(x / spread)
     usual, _ = tree.query(ordinary / spread)
-    return NearestEvent(float(distance / root), float((usual >= distance).mean()), events[nearest])
+    return NearestEvent(float(distance / root), float(np.mean(usual >= distance)), events[nearest])
 
 
 MOST_MODES = 8
