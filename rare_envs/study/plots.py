@@ -52,8 +52,8 @@ NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
-STYLE: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if "backend" not in name}
-STYLE |= {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+DEFAULTS: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if "backend" not in name}
+STYLE: Any = {**DEFAULTS, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 """Settings of matplotlib for every picture, whatever a matplotlibrc says, which may lie in the folder of somebody else.
 Each is a `Figure` of its own, without pyplot: no window, no global state, whatever backend the user has."""
 DOTS_PER_INCH = 120
@@ -381,6 +381,7 @@ def draw_frames(drive: Drive) -> list[Image.Image]:
     return shown
 
 
+@matplotlib.rc_context(DEFAULTS)
 def _draw_curves(drive: Drive) -> tuple[Image.Image, list[int], tuple[int, int]]:
     """Return the measure over time as a picture; the column of each moment in it, and the ends of the axes [pixels]."""
     measure = drive.problem.world.measurement.measure
