@@ -287,10 +287,10 @@ def saw_originals(header: Mapping[str, Any], statistics: Any = None) -> bool:
         return False
     if header[ORIGINAL] is None or not _keeps_replays(header):
         return header[ORIGINAL] is None
+    if statistics is None:
+        return not _has_original_observations(header, last)
     original = _open_observation(header, ORIGINAL)
-    if _has_original_observations(header, last) or original is None:
-        return False
-    return statistics is None or _distance(last, original) < _distance(last, _normalise(original, statistics))
+    return _distance(last, original) < _distance(last, _normalise(original, statistics))
 
 
 def describe_foreign_statistics(header: Mapping[str, Any], statistics: Any, own: Any) -> str:
@@ -299,10 +299,7 @@ def describe_foreign_statistics(header: Mapping[str, Any], statistics: Any, own:
         return ""
     if saw_originals(header, statistics):
         return "its file says that it was trained without VecNormalize"
-    theirs, last, original = (
-        statistics.observation_space,
-        *(_open_observation(header, name) for name in (LAST, ORIGINAL)),
-    )
+    theirs, (last, original) = statistics.observation_space, (_open_observation(header, at) for at in (LAST, ORIGINAL))
     if isinstance(own, spaces.Box) and isinstance(theirs, spaces.Box) and own.shape == theirs.shape and own != theirs:
         return "they are of an environment whose observations have other bounds"
     if original is None or last is None:

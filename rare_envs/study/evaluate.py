@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
+import os
 import pickle
 import reprlib
 import shlex
@@ -238,9 +239,10 @@ ELSEWHERE_TIMEOUT = 60.0
 """How long that process may take [s]."""
 _ELSEWHERE = """
 import importlib, os, pickle, sys
-answer, sys.path[:0] = os.dup(1), [""]
+answer = os.dup(1)
 os.dup2(2, 1)
-module, name, queries = pickle.load(sys.stdin.buffer)
+here, sys.path[:], module, name, queries = pickle.load(sys.stdin.buffer)
+os.chdir(here)
 ego = getattr(importlib.import_module(module), name)()
 if not hasattr(ego, "predict"):
     from rare_envs.egos.needs import wrap_callable
@@ -251,7 +253,7 @@ with os.fdopen(answer, "wb") as file:
     file.flush()
     os._exit(0)
 """
-"""Program of that process, which imports nothing slow."""
+"""Program of that process, which imports nothing slow, and nothing from the working directory but the ego's module."""
 
 
 class _Recorder:
@@ -279,8 +281,10 @@ def count_other_answers(study: Study, x: FloatArray) -> int:
     policy = replace(driver.policy, policy=recorder) if isinstance(driver.policy, WrappedPolicy) else recorder
     try:
         rollout(study.problem.world, replace(driver, policy=policy), torch.from_numpy(x).float())
-        queries = [(seen, start) for seen, start, _ in recorder.kept]
-        message = pickle.dumps((*name.split(":"), queries))
+        queries, module = [(seen, start) for seen, start, _ in recorder.kept], name.partition(":")[0]
+        top = Path(str(sys.modules[module.partition(".")[0]].__file__))
+        places = [str(top.parents[top.name == "__init__.py"]), *sys.path]
+        message = pickle.dumps((os.getcwd(), places, *name.split(":"), queries))
         own = np.concatenate([action.reshape(len(action), -1) for _, _, action in recorder.kept])
         with ThreadPoolExecutor(N_PROCESSES) as threads:
             apart = np.abs([answer - own for answer in threads.map(_ask_elsewhere, [message] * N_PROCESSES)])
@@ -292,7 +296,8 @@ def count_other_answers(study: Study, x: FloatArray) -> int:
 def _ask_elsewhere(message: bytes) -> FloatArray:
     """Return the answers to all queries of a message in another process, one row each."""
     program = [sys.executable, "-c", _ELSEWHERE]
-    done = subprocess.run(program, input=message, stdout=-1, stderr=-3, timeout=ELSEWHERE_TIMEOUT, check=True)
+    how: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "cwd": os.path.abspath(os.sep)}
+    done = subprocess.run(program, input=message, timeout=ELSEWHERE_TIMEOUT, check=True, **how)
     return np.concatenate([np.reshape(action, (len(action), -1)).astype(float) for action in pickle.loads(done.stdout)])
 
 
