@@ -287,10 +287,10 @@ def saw_originals(header: Mapping[str, Any], statistics: Any = None) -> bool:
         return False
     if header[ORIGINAL] is None or not _keeps_replays(header):
         return header[ORIGINAL] is None
-    if statistics is None:
-        return not _has_original_observations(header, last)
     original = _open_observation(header, ORIGINAL)
-    return _distance(last, original) < _distance(last, _normalise(original, statistics))
+    if _has_original_observations(header, last) or original is None:
+        return False
+    return statistics is None or _distance(last, original) < _distance(last, _normalise(original, statistics))
 
 
 def describe_foreign_statistics(header: Mapping[str, Any], statistics: Any, own: Any) -> str:
