@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 import rare_envs
 from rare_envs.scenarios.registry import env_id_of
+from rare_envs.study import drive_again, write_film
+from rare_envs.study.replay import find_failure
 from rare_envs.study.risk import SCENARIO_SET, risk
 from rare_envs.study.text import print_report
 from training import train_ego
@@ -68,6 +70,10 @@ def demo(steps: int, out: Path) -> None:
     random_rate = random_collision_rate()
     print(f"for comparison: a policy that acts at random collides in {random_rate:.0%} of 1,000 scenarios")
     print(f"\n{found}")
+    film = out / "crash.gif"
+    recorded = find_failure(out / cut_in.name, 0, trust=True)
+    write_film(film, drive_again(recorded.problem, recorded.x))
+    print(f"the most likely crash in a cut-in, as a film: {film}")
     print("\nNext, from the folder of this repository (the commands are in .venv/bin):")
     for words, why in (
         (f"estimate {ENV_ID} --ego {ego} --method mc --max-sim 1000000", "check the first number by plain Monte Carlo"),

@@ -194,25 +194,31 @@ def format_record(record: Mapping[str, Any]) -> str:
 
 
 def _format_compared(table: Mapping[str, Any]) -> Iterator[str]:
-    """Return a table of a record as Markdown; what no value has is no column, and labels stand once."""
-    all_in = table["all_in_title"]
-    rows, before = [], None
+    """Return a table of a record as Markdown: a row a method with "paper / ours" by quantity, and notes below."""
+    rows: dict[tuple[str, ...], dict[str, str]] = {}
+    notes: list[str] = []
     for value in table["values"]:
-        cells = {
-            "quantity": str(value["quantity"]),
-            "paper": format_number(value["paper"]),
-            "ours": format_number(value["ours"]),
-            "95 % interval": format_ends(value["interval"]),
-            "difference": format_difference(value["difference"]),
-            f"paper, {all_in}": format_number(value["paper_all_in"]),
-            f"ours, {all_in}": format_number(value["ours_all_in"]),
-            "released code": value["released"] or NOTHING,
-            "why they differ": ", ".join(value["reasons"]) or NOTHING,
-        }
-        rows.append(([""] * len(table["keys"]) if value["labels"] == before else value["labels"], cells))
-        before = value["labels"]
-    shown = [head for head in (rows[0][1] if rows else ()) if any(cells[head] != NOTHING for _, cells in rows)]
-    return _format_rows([*table["keys"], *shown], [[*labels, *map(cells.get, shown)] for labels, cells in rows])
+        labels, (quantity, _, rests_on) = tuple(value["labels"]), str(value["quantity"]).partition(" (")
+        cells = rows.setdefault(labels, {})
+        cells[quantity] = _format_pair(value["paper"], value["ours"])
+        cells[quantity] += f", {rests_on.rstrip(')')}" * bool(rests_on)  # events, say
+        if value["interval"] is not None:
+            cells[quantity] += f" ({format_ends(value['interval'])})"
+        all_in = value["paper_all_in"], value["ours_all_in"]
+        if all_in != (None, None):
+            cells[f"{quantity}, {table['all_in_title']}"] = _format_pair(*all_in)
+        said = [f"the released code: {value['released']}"] * bool(value["released"])
+        said += [f"*{reason}*" for reason in value["reasons"]]
+        notes += [f"- {', '.join(labels)}: {quantity}: {'; '.join(said)}"] * bool(said)
+    heads = list(dict.fromkeys(head for cells in rows.values() for head in cells))
+    body = [[*labels, *(cells.get(head, NOTHING) for head in heads)] for labels, cells in rows.items()]
+    yield from _format_rows([*table["keys"], *(f"{head}: paper / ours" for head in heads)], body)
+    yield from ("", *notes) if notes else ()
+
+
+def _format_pair(paper: float | None, ours: float | None) -> str:
+    """Return a number of the paper beside ours."""
+    return f"{format_number(paper)} / {format_number(ours)}"
 
 
 def format_number(value: float | None) -> str:
@@ -227,18 +233,6 @@ def format_number(value: float | None) -> str:
     if abs(value) >= 1000:
         return f"{value:,.0f}"
     return f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
-
-
-def format_difference(value: float | None) -> str:
-    """Return a relative difference in percent, or as a factor where it is large.
-
-    Example:
-        >>> [format_difference(value) for value in (0.05, -0.2, 20.4, -0.99, None)]
-        ['+5 %', '-20 %', '× 21.4', '× 0.01', '–']
-    """
-    if value is None:
-        return NOTHING
-    return f"× {format_number(1.0 + value)}" if value > 2.0 or value < -0.9 else f"{100 * value:+.0f} %"
 
 
 def format_ends(interval: Sequence[float] | None) -> str:

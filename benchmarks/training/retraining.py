@@ -6,7 +6,7 @@ A PPO ego is trained in a cut-in, and then in rounds: estimate, add the failures
 The control is the same ego trained on for as many steps in ordinary scenarios only. In each round of each, p is
 estimated twice, with different seeds: the failures of the first estimate are trained on, those of the second are held
 out, and both are driven again by the ego of the next round. Plain Monte Carlo counts beside them. Writes
-benchmarks/results/retraining.json and docs/images/retraining.png; rounds that the file has are not repeated.
+benchmarks/results/retraining.json; rounds that the file has are not repeated.
 """
 
 from __future__ import annotations
@@ -155,31 +155,6 @@ def compare_arms(rounds: Sequence[RetrainingRound], number: int) -> tuple[float,
     return middle, low, high
 
 
-def draw_rounds(rounds: Sequence[RetrainingRound], path: Path) -> None:
-    """Draw p against rounds, with intervals, and how many of found and of held-out failures are left."""
-    import matplotlib.pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.0), layout="constrained")
-    for colour, arm, shift, words in (
-        ("tab:red", ARMS[0], 0.0, "with failures"),
-        ("tab:grey", ARMS[1], 0.05, "ordinary scenarios only"),
-    ):
-        for k, seed in enumerate(sorted({one.seed for one in rounds})):
-            own = sorted((one for one in rounds if (one.arm, one.seed) == (arm, seed)), key=lambda one: one.round)
-            values, place = np.array([one.held_out for one in own]), np.array([one.round + shift for one in own])
-            errors = np.abs(values[:, 1:].T - values[:, 0])
-            label = None if k else words
-            left.errorbar(place, values[:, 0], errors, color=colour, marker="o", ms=3, lw=1, capsize=2, label=label)
-        still = [one.still_failing for one in rounds if one.arm == arm and one.still_failing is not None]
-        right.plot(*zip(*still, strict=True), "o", color=colour, ms=4, label=words)
-    left.set(yscale="log", xlabel="round", ylabel="P[collision], 95 %, other seed", xticks=range(ROUNDS + 1))
-    left.legend()
-    right.plot([0, 1], [0, 1], color="black", lw=0.6)
-    right.set(xlabel="found failures that still fail a round later", ylabel="held-out failures that still do")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def read_rounds() -> list[RetrainingRound]:
     """Return what has been measured so far."""
     if not RETRAINING_RESULT.exists():
@@ -205,7 +180,6 @@ def write_rounds(rounds: Sequence[RetrainingRound]) -> None:
 @use_one_thread()
 def main(
     runs: Annotated[Path, typer.Option(help="Folder of the egos.")] = Path("runs/retraining"),
-    picture: Annotated[Path, typer.Option(help="File of the picture.")] = Path("docs/images/retraining.png"),
     seeds: Annotated[int, typer.Option(help="Trainings, each with its own seed.")] = 8,
 ) -> None:
     """Measure what is not measured yet, and print the table."""
@@ -219,7 +193,6 @@ def main(
                 write_rounds([*rest, one])
                 print(format_rounds([one]).splitlines()[-1], flush=True)
     rounds = read_rounds()
-    draw_rounds(rounds, picture)
     print(format_rounds(rounds))
     for number in range(1, ROUNDS + 1):
         middle, low, high = compare_arms(rounds, number)

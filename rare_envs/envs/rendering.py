@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import TARGET_SPEEDS
+from rare_envs.measures.longitudinal import TTC_MAX
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.bodies import overlaps
@@ -241,11 +242,16 @@ class Renderer:
 def caption(world: World, episode: Episode, time: float | None, row: int = 0) -> str:
     """Return time, speed, gap and time to collision of the ego, and the measure of the episode so far, as text."""
     gap, closing = float(episode.lead.gap[row]), float(episode.lead.closing_speed[row])
-    ttc = gap / closing if closing > 0 and gap > 0 else np.inf
     parts = [] if time is None else [f"{time:4.1f} s"]
     parts.append(f"ego {float(episode.state.speed[row, 0]):4.1f} m/s")
-    parts.append(f"gap {gap:5.1f} m" if np.isfinite(gap) else "nobody ahead")
-    parts.append(f"TTC {ttc:4.1f} s" if ttc < 100 else "TTC   -  ")
-    measure = f" ({world.measurement.measure})" if isinstance(world.measurement.measure, str) else ""
-    parts.append(f"f so far{measure} {float(episode.f[row]):.2f}")
+    if bool(episode.collided[row]):
+        return "    ".join([*parts, "crash"])
+    parts.append(f"gap {max(gap, 0.0):5.1f} m" if np.isfinite(gap) else "nobody ahead")
+    if closing > 0 and gap / closing < TTC_MAX:
+        parts.append(f"time to collision {max(gap, 0.0) / closing:4.1f} s")
+    measure, f = world.measurement.measure, float(episode.f[row])
+    if measure not in ("ttc", "lidar_ttc"):
+        parts.append(f"{measure if isinstance(measure, str) else 'f'} so far {f:.2f}")
+    elif f < TTC_MAX:
+        parts.append(f"closest so far {f:.1f} s")
     return "    ".join(parts)

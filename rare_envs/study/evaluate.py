@@ -337,7 +337,7 @@ def run_into(
         >>> with TemporaryDirectory() as folder:
         ...     report = run_into(Path(folder), prepare(question))
         ...     sorted(path.name for path in Path(folder).iterdir())
-        ['episodes.parquet', 'failures.csv', 'plot.png', 'result.json', 'study.json']
+        ['answer.png', 'crash.png', 'episodes.parquet', 'failures.csv', 'failures.png', 'result.json', 'study.json']
     """
     study = settle_chunk(study, executor)
     part = part and not study.ego_was_given

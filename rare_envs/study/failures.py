@@ -162,8 +162,8 @@ class Severity:
         """Draw P[collision with delta-v > v] over v with its bands; needs matplotlib."""
         with drawing_axes(ax) as axes:
             self.curve.plot(axes)
-            axes.set_xlabel("delta-v [m/s]")
-            axes.set_ylabel("P[collision with a larger delta-v]")
+            axes.set(xlabel="delta-v [m/s]", ylabel="P[collision with a larger delta-v]")
+            axes.set_title("How hard the collisions are")
         return axes
 
 

@@ -6,7 +6,7 @@ import contextlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Affine2D
 from PIL import Image, ImageDraw
 
@@ -24,15 +25,18 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.envs import rendering
 from rare_envs.exposure import RateInterval, TotalRate
 from rare_envs.files import replace_file
+from rare_envs.measures import MEASURES
 from rare_envs.people import HumanBenchmark
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
+from rare_envs.study import run_folder
 from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
 from rare_envs.study.events import EventRate
-from rare_envs.study.replay import Drive, drive_again
+from rare_envs.study.replay import Drive, drive_again, name_parties
 from rare_envs.study.report import Report
-from rare_envs.study.text import EVENT_NOUNS, format_rate, format_with_interval
+from rare_envs.study.text import EVENT_NOUNS, format_with_interval, name_measure
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
     from samplers.sample import Failures
@@ -44,27 +48,34 @@ MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
 VIEW_BEHIND, VIEW_FAR_BEHIND, VIEW_AHEAD = 12.0, 45.0, 48.0
 """Extent of a bird's-eye view of the road around the ego [m]; further behind where there is traffic."""
-ORDINARY_ROAD = 14.0
-"""Width of a road [m] that a view has room for; on wider ones it is higher."""
-CURVES = 3.2
-"""Height of the curves under the views, over that of a view of an ordinary road."""
 NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
+LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = rendering.ROLE_COLOURS["ego"], "#c0392b", "#b8b8b8"
+"""What is of the ego, in curves as on the road; failures; and ordinary traffic or people."""
+MODEL_COLOUR = "#8e5aa8"
+"""The human driver model."""
+MILLION = 1_000_000
+DECADES = 1e3
+"""Ratio of the ends of the axis of an answer at least."""
 DEFAULTS: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if "backend" not in name}
-STYLE: Any = {**DEFAULTS, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+STYLE: Any = {
+    **DEFAULTS,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": matplotlib.cycler(color=[LINE_COLOUR, "#7a7a7a", MODEL_COLOUR]),
+}
 """Settings of matplotlib for every picture, whatever a matplotlibrc says, which may lie in the folder of somebody else.
 Each is a `Figure` of its own, without pyplot: no window, no global state, whatever backend the user has."""
-DOTS_PER_INCH = 120
-"""Resolution of every picture."""
+DOTS_PER_INCH, WIDTH = 120, 6.0
+"""Resolution of every picture, and its width [inch]: text can be read where 700 pixels are shown."""
 MOST_LETTERS = 1_000
 """Of one text in a picture."""
-LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
 
 
 @contextlib.contextmanager
-def saved_figure(path: Path, width: float, height: float) -> Iterator[Figure]:
+def saved_figure(path: Path, height: float, width: float = WIDTH) -> Iterator[Figure]:
     """Yield an empty picture of a size [inch], which is saved at the end of the block; a warning if it cannot be drawn.
 
     Numbers that are written beside it do not wait for it.
@@ -102,51 +113,86 @@ def show_literally(artist: Artist) -> None:
             show_literally(part)
 
 
-def save_plot(path: Path, report: Report) -> None:
-    """Draw a report and save it."""
-    road, estimate, question = report.study.problem.world.scenario.road, report.estimate, report.study.question
-    view = max(1.0, road.lanes * road.width / ORDINARY_ROAD)  # height of a bird's-eye view over that of usual roads
-    low, high = estimate.interval
-    with saved_figure(path, 16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)) as figure:
-        figure.suptitle(
-            f"{question.env_id}, ego {question.ego}: P[f ≤ {estimate.gamma:g}] = {estimate.p:.2e}   "
-            f"({100 * estimate.confidence:g} % interval {low:.1e} to {high:.1e}, "
-            f"{estimate.n_sim:,} simulations{report.average and f'; {report.average}'})",
-            fontsize=12,
-            fontweight="bold",
-        )
-        ((left, middle, right),) = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
-        draw_convergence(left.subplots(), report.to_dict())
-        draw_failures(middle.subplots(), report.study.problem.space, estimate.failures)
-        drive = _replay_likeliest_failure(report)
-        if isinstance(drive, str):
-            _write_message(right.subplots(), drive)
-        else:
-            draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
-
-
-def _replay_likeliest_failure(report: Report) -> Drive | str:
-    """Return the likeliest failure driven again, or the reason why it cannot be shown."""
-    failures = report.estimate.failures
+def save_pictures(folder: Path, report: Report) -> None:
+    """Draw the answer of a run, its most likely crash, and the failures among ordinary traffic: a file for each."""
+    failures, space = report.estimate.failures, report.study.problem.space
+    with saved_figure(folder / run_folder.ANSWER, 2.2) as figure:
+        draw_answer(figure.subplots(), report)
     driven = np.flatnonzero(~np.isnan(failures.f))  # not those on which the ego failed
-    if not len(driven):
-        return "no failure found that can be shown" if failures.total else explain_no_failure(report)
+    if len(driven):
+        with saved_figure(folder / run_folder.SCATTER, 4.4) as figure:
+            draw_failures(figure.subplots(), space, failures)
+        road = report.study.problem.world.scenario.road
+        height = 1.0 + MOMENTS * max(0.7, 0.055 * road.lanes * road.width)
+        with saved_figure(folder / run_folder.CRASH_STRIP, height) as figure:
+            _draw_likeliest(figure, report, failures.x[driven[0]])
+
+
+def _draw_likeliest(figure: Figure, report: Report, x: FloatArray) -> None:
+    """Draw the likeliest failure (d,) driven again, or write the reason why it cannot be shown."""
     try:
-        return drive_again(report.study.problem, failures.x[driven[0]])
+        drive = drive_again(report.study.problem, x)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
-        return f"the failure cannot be shown: {reason_of(error)}"
+        axes = figure.subplots()
+        axes.set_axis_off()
+        message = f"the failure cannot be shown: {reason_of(error)}"
+        axes.text(0.5, 0.5, message, ha="center", va="center", wrap=True, transform=axes.transAxes)
+        return
+    how = "no crash" if drive.crash is None else "{} into {}".format(*name_parties(drive.crash, drive.names))
+    figure.suptitle(f"The most likely failure: {how}", fontweight="bold")
+    for axes, t in zip(figure.subplots(MOMENTS, 1), choose_moments(drive), strict=True):
+        draw_moment(axes, drive, t)
+    roles = drive.problem.world.scenario.vehicle_names
+    shown = [Patch(color=vehicle_colour(roles[j], j), label=name) for j, name in enumerate(drive.names)]
+    figure.legend(handles=shown, loc="outside lower center", ncols=4, frameon=False)
 
 
-def explain_no_failure(report: Report) -> str:
-    """Return what a run without a failure says."""
-    estimate = report.estimate
-    return (
-        f"None of {estimate.n_sim:,} simulations failed.\n\n"
-        f"P[f ≤ {estimate.gamma:g}] is below {estimate.interval[1]:.1e} ({100 * estimate.confidence:g} %):\n"
-        f"less than one failure in {1 / estimate.interval[1]:,.0f} scenarios.\n\n"
-        "Ten times as many simulations would lower this bound to a tenth;\n"
-        "methods that search for failures go further."
-    )
+def one_in(p: float) -> str:
+    """Return a probability in words, with two digits.
+
+    Example:
+        >>> one_in(2.97e-4), one_in(1e-8), one_in(0.452)
+        ('1 in 3,400', '1 in 100 million', '45 in 100')
+    """
+    if p > 0.1:
+        return f"{100 * p:.0f} in 100"
+    n = float(f"{1 / p:.2g}")
+    return f"1 in {n:,.0f}" if n < MILLION else f"1 in {n / MILLION:,.10g} million"
+
+
+def draw_answer(axes: Axes, report: Report) -> None:
+    """Draw p with all that its interval can hold, that of the simulations within it; a bound alone as an arrow."""
+    estimate, question = report.estimate, report.study.question
+    base, (low, high), level = estimate.base_uncertainty, estimate.interval, f"{100 * estimate.confidence:g} %"
+    widest, behind = (low, high), "simulation"
+    if base is not None and estimate.p > 0 and (base.interval or base.bound is not None):
+        ends = base.interval or (0.0, base.bound or 1.0)
+        widest, behind = (min(low, ends[0]), max(high, ends[1])), f"from {base.fitted_to}"
+    start = min(end for end in (*widest, low, high, estimate.p) if end > 0) / (3 if widest[0] > 0 else 30)
+    top = min(3 * max(widest[1], high), 1.0)
+    start = min(start, top / DECADES)
+    _draw_interval(axes, 0.0, estimate.p, widest, LINE_COLOUR, start)
+    axes.plot([], [], color=LINE_COLOUR, linewidth=9, alpha=0.35, label=f"{level}, {behind}")
+    if behind != "simulation":
+        bar: Any = {"color": LINE_COLOUR, "linewidth": 9, "label": "simulation alone"}
+        axes.plot([max(low, start), high], [0, 0], solid_capstyle="butt", **bar)
+    axes.set(xscale="log", xlim=(start, top), ylim=(-1, 1), yticks=[])
+    axes.spines["left"].set_visible(False)
+    axes.xaxis.set_major_locator(LogLocator(numticks=5))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda p, _: one_in(p)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(f"{question.ego} in {question.env_id}")
+    collides = question.measure in ("ttc", "lidar_ttc") and estimate.gamma == 0
+    event = "Collision" if collides else f"f ≤ {estimate.gamma:g}"
+    if estimate.p > 0:
+        most, least = one_in(widest[1]), one_in(widest[0]) if widest[0] > 0 else ""
+        ends = f"{least} to {most}" if least else f"at most {most}"
+        said = f"{event}: {one_in(estimate.p)} scenarios\n{level}: {ends}"
+    else:
+        said = f"{event}: fewer than {one_in(high)} scenarios ({level})\n"
+        said += f"no failure counts in {estimate.n_sim:,} simulations"
+    axes.set_title(said, fontweight="bold")
+    axes.figure.legend(loc="outside lower center", ncols=2, frameon=False)  # type: ignore[union-attr]
 
 
 def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
@@ -201,26 +247,42 @@ def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
 
 
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
-    """Draw failures over ordinary traffic in the two parameters in which they differ most."""
+    """Draw failures over ordinary traffic in the two parameters in which they differ most, and say how they do."""
     ordinary, columns = draw_ordinary(space)[:BACKGROUND_DRAWS], list_columns(space)
-    a, b = 0, 1
-    if len(failures):
-        shown = np.flatnonzero([column.shown for column in columns])
-        spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
-        shift = np.abs(failures.x[:, shown].mean(axis=0) - ordinary[:, shown].mean(axis=0)) / spread
-        a, b = (int(j) for j in shown[np.argsort(-shift, kind="stable")][:2])
-    axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=ORDINARY_COLOUR, label="ordinary traffic", linewidths=0)
-    axes.set(xlabel=columns[a].label, ylabel=columns[b].label)
-    if len(failures):
-        rising = slice(None, None, -1)  # the most likely on top
-        x, y = failures.x[rising, a], failures.x[rising, b]
-        dots = axes.scatter(x, y, s=12, c=failures.log_p0[rising], cmap="YlOrRd", linewidths=0)
-        assert axes.figure is not None
-        axes.figure.colorbar(dots, ax=axes, label="log density in traffic (darker: more likely)")
-        axes.plot(x[-1], y[-1], "*", color="black", markersize=13, label="most likely failure")
-    title = "Failures against ordinary traffic (two most shifted parameters)"
-    axes.set_title(title if len(failures) else "Ordinary traffic; no failure found", fontsize=10)
-    axes.legend(loc="best", fontsize=8)
+    shown = np.flatnonzero([column.shown for column in columns])
+    spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
+    shift = (np.median(failures.x[:, shown], axis=0) - np.median(ordinary[:, shown], axis=0)) / spread
+    places = np.argsort(-np.abs(shift), kind="stable")[:2]
+    a, b = (int(j) for j in shown[[places[0], places[-1]]])
+    axes.scatter(ordinary[:, a], ordinary[:, b], s=8, color=ORDINARY_COLOUR, label="ordinary traffic", linewidths=0)
+    axes.scatter(failures.x[:, a], failures.x[:, b], s=10, color=HIT_COLOUR, label="failures", linewidths=0)
+    axes.plot(failures.x[0, a], failures.x[0, b], "*", color="black", markersize=13, label="most likely failure")
+    axes.set(xlabel=columns[a].label.replace("_", " "), ylabel=columns[b].label.replace("_", " "))
+    words = [
+        f"{'high' if shift[place] > 0 else 'low'} {columns[shown[place]].name.replace('_', ' ')}"
+        for place in places
+        if abs(shift[place]) > SHIFTED
+    ]
+    axes.set_title(f"Failures: {', '.join(words) or 'much as ordinary traffic'}", fontweight="bold")
+    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)  # type: ignore[union-attr]
+
+
+class SeverityRow(NamedTuple):
+    """Collisions with a larger delta-v."""
+
+    km_h: float
+    p: float
+    low: float
+    high: float
+
+
+def list_severity(severity: Mapping[str, Any] | None) -> list[SeverityRow]:
+    """Return P[collision with a larger delta-v] at three delta-v, evenly spread over the curve of a run."""
+    if severity is None:
+        return []
+    columns = (severity["curve"][name] for name in ("delta_v", "p", "low", "high"))
+    rows = [SeverityRow(3.6 * v, *rest) for v, *rest in zip(*columns, strict=True) if rest[0] > 0]
+    return rows[:: max(1, (len(rows) - 1) // 2)][:3]
 
 
 def vehicle_colour(name: str, number: int) -> str:
@@ -232,14 +294,6 @@ def choose_moments(drive: Drive) -> list[int]:
     """Return `MOMENTS` moments, spread over the last seconds up to the worst one."""
     first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
     return [int(t) for t in np.linspace(first, drive.worst, MOMENTS).round()]
-
-
-def draw_drive(axes: list[Axes], drive: Drive) -> None:
-    """Draw the seconds up to the worst moment of a drive from above, and its gap and speeds over time."""
-    for view, t in zip(axes[:MOMENTS], choose_moments(drive), strict=True):
-        draw_moment(view, drive, t)
-    axes[0].set_title("The most likely failure from above, and its speeds and gap", fontsize=10)
-    draw_speeds(axes[-1], drive)
 
 
 def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
@@ -266,43 +320,70 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
     axes.set_ylim(right + 0.1 * drive.road.width, left - 0.1 * drive.road.width)
     axes.set(aspect="equal", xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
-    axes.set_ylabel(f"{drive.time[t]:.1f} s", rotation=0, ha="right", va="center")
-    if t == drive.worst:
-        style: Any = {"color": HIT_COLOUR, "ha": "right", "va": "center", "fontweight": "bold"}
-        axes.text(VIEW_AHEAD, drive.position[t, 0, 1], "collision" if hit else "closest", **style)
+    before = drive.time[drive.worst] - drive.time[t]
+    at: Any = {"color": HIT_COLOUR, "fontweight": "bold"} if t == drive.worst else {}
+    words = ("crash" if hit else "closest") if t == drive.worst else f"{before:.1f} s\nbefore"
+    axes.set_ylabel(words, rotation=0, ha="right", va="center", **at)
 
 
 def draw_speeds(axes: Axes, drive: Drive) -> None:
-    """Draw speeds (left axis) and the gap to the vehicle ahead (right axis) over time."""
+    """Draw the vehicles' speeds over time."""
     for j, (name, role) in enumerate(zip(drive.names, drive.problem.world.scenario.vehicle_names, strict=True)):
-        axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(role, j), label=f"speed of {name}")
+        axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(role, j), label=name)
     axes.set(xlabel="time [s]", ylabel="speed [m/s]", ylim=(0, HEADROOM * max(1.0, float(drive.speed.max()))))
-    gaps = axes.twinx()
-    gap = np.where(np.isfinite(drive.gap), drive.gap, np.nan)
-    gaps.plot(drive.time, gap, color="black", linestyle=":", label="gap to the vehicle ahead")
-    gaps.set_ylabel("gap [m]")
-    gaps.set_ylim(min(0.0, float(np.nanmin(gap, initial=0.0))), HEADROOM * float(np.nanmax(gap, initial=1.0)))
-    gaps.spines["right"].set_visible(True)
-    parts = zip(axes.get_legend_handles_labels(), gaps.get_legend_handles_labels(), strict=True)
-    handles, labels = ([*own, *more] for own, more in parts)
-    axes.legend(handles, labels, loc="upper center", ncols=2 if len(drive.names) < 5 else 3, fontsize=8, frameon=False)
+    axes.legend(loc="upper center", ncols=3, fontsize=8, frameon=False)
 
 
-def _write_message(axes: Axes, text: str) -> None:
-    """Write a sentence in place of a drawing."""
-    axes.set_axis_off()
-    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+SHOWN_SECONDS = 5.0
+"""Upper end of the axis of a measure in seconds: what is above shows as a gap, the cap of a time to collision too."""
 
 
 def draw_measure(axes: Axes, drive: Drive) -> None:
-    """Draw the measure over time: that of each moment, and that of the drive so far."""
-    axes.plot(drive.time, drive.f_alone, color="#777777", linewidth=1, label="this moment")
-    axes.step(drive.time, drive.f_so_far, where="post", color="black", linewidth=1.5, label="f so far")
-    axes.set_xlabel("time [s]")
+    """Draw the measure over time: that of each moment, the least so far, and where the crash or the worst moment is."""
+    measure = drive.problem.world.measurement.measure
+    name = measure if isinstance(measure, str) else ""
+    seconds = getattr(MEASURES.get(name), "unit", "") == "s"
+    top = SHOWN_SECONDS if seconds else np.inf
+    alive = drive.time < (drive.time[-1] if drive.collided else np.inf)  # not the value that stands for a collision
+    for values, words, style in (
+        (drive.f_alone, "this moment", {"color": "#777777", "linewidth": 1}),
+        (drive.f_so_far, "closest so far", {"color": "black", "linewidth": 1.5, "drawstyle": "steps-post"}),
+    ):
+        axes.plot(drive.time, np.where(alive & (values <= top), values, np.nan), label=words, **style)
+    crash: Any = {"color": HIT_COLOUR, "linewidth": 1.5, "label": "crash" if drive.collided else "closest"}
+    axes.axvline(drive.time[drive.worst], **crash)
+    axes.set(xlabel="time [s]", ylabel=SAID.get(name, name_measure(name)))
+    if seconds:
+        axes.set_ylim(min(0.0, *axes.get_ylim()), top)
 
 
+SAID = {"ttc": "time to\ncollision [s]", "lidar_ttc": "time to\ncollision [s]", "clearance": "distance [m]"}
+"""Measures in words, for an axis."""
+SEVERE = 1.0
+"""Delta-v [m/s] beyond which collisions have a picture of their severity; below it a table says all."""
+SHIFTED = 0.5
+"""Shift of the median of failures over ordinary traffic, in its standard deviations, that is called low or high."""
 FRACTION_BELOW = 0.1
 """Left end of the axis over the smallest number on it, where an interval reaches down to 0."""
+
+
+class RateRow(NamedTuple):
+    """Collisions per million km in one kind of event, beside people's."""
+
+    name: str
+    rate: float
+    interval: RateInterval
+    people: HumanBenchmark | None
+    model: float = 0.0
+    """Of the human driver model."""
+
+
+def _make_row(each: EventRate) -> RateRow:
+    """Return the row of an event, with whether its rate is calibrated."""
+    name, known = EVENT_NOUNS.get(each.event, each.event), each.calibration
+    name = f"{name}\n({'no calibration' if known is None else 'not calibrated'})" if each.uncalibrated else name
+    model = 0.0 if known is None else known.per_million_km().p
+    return RateRow(name, each.rate.per_million_km, each.rate.interval_per_million_km, each.people, model)
 
 
 def save_risk_plot(
@@ -310,58 +391,57 @@ def save_risk_plot(
 ) -> None:
     """Draw the rates of events and their sum beside those of people, and save it."""
     level, ends = f"{100 * total.confidence:g} %: ", total.interval_per_million_km
-    rows: list[tuple[str, float, RateInterval, HumanBenchmark | None]] = [
-        (_name_row(each), each.rate.per_million_km, each.rate.interval_per_million_km, each.people) for each in events
-    ]
-    rows.append(("all of these", total.per_million_km, ends, people))
-    with saved_figure(path, 10, 2.2 + 0.8 * len(rows)) as figure:
+    rows = [_make_row(each) for each in events] + [RateRow("all of these", total.per_million_km, ends, people)]
+    with saved_figure(path, 1.8 + 0.75 * len(rows), 7.0) as figure:
         said = format_with_interval(total.per_million_km, ends, " collisions per million km", level)
-        figure.suptitle(f"{ego}: {said}", fontsize=14, fontweight="bold")
+        figure.suptitle(f"{ego}: {said}", fontweight="bold", wrap=True)
         draw_rates(figure.subplots(), rows)
 
 
-def _name_row(each: EventRate) -> str:
-    """Return an event in words, and whether its rate is calibrated."""
-    name = EVENT_NOUNS.get(each.event, each.event)
-    why = each.uncalibrated if each.calibration is not None else "no calibration"  # without a file's long name
-    return f"{name}\n({why})" if why else name
-
-
-def draw_rates(axes: Axes, rows: Sequence[tuple[str, float, RateInterval, HumanBenchmark | None]]) -> None:
-    """Draw rates with intervals, and below each that of people."""
-    human = [(each.per_million_km, each.interval_per_million_km) for *_, each in rows if each is not None]
-    shown = [end for ends in (*(row[2] for row in rows), *(ends for _, ends in human)) for end in ends if end > 0]
-    start = FRACTION_BELOW * min(shown)
-    for row, (_, rate, ends, people) in enumerate(rows):
-        _draw_interval(axes, row - 0.15, rate, ends, HIT_COLOUR if row == len(rows) - 1 else LINE_COLOUR, start)
-        if people is not None:
-            beside = people.per_million_km, people.interval_per_million_km
-            _draw_interval(axes, row + 0.15, *beside, ORDINARY_COLOUR, start)
-    axes.plot([], [], "o-", color=LINE_COLOUR, linewidth=4, label="the ego")
-    axes.plot([], [], "o-", color=ORDINARY_COLOUR, linewidth=4, label="people in the same events (100-Car)")
-    axes.set(xscale="log", xlim=(start, max(shown) / FRACTION_BELOW), ylim=(len(rows) - 0.4, -0.6))
-    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=12)
-    axes.set_xlabel("collisions per million km", fontsize=12)
+def draw_rates(axes: Axes, rows: Sequence[RateRow]) -> None:
+    """Draw rates with intervals, below each that of people, and the human driver model as far as it was measured."""
+    pairs = [each.interval for each in rows]
+    pairs += [each.people.interval_per_million_km for each in rows if each.people is not None]
+    ends = [end for pair in pairs for end in pair if end > 0]
+    start = FRACTION_BELOW * min(ends)
+    for place, each in enumerate(rows):
+        _draw_interval(axes, place - 0.15, each.rate, each.interval, LINE_COLOUR, start)
+        if each.people is not None:
+            beside = each.people.per_million_km, each.people.interval_per_million_km
+            _draw_interval(axes, place + 0.15, *beside, ORDINARY_COLOUR, start)
+        if each.model > start:
+            axes.plot(each.model, place + 0.15, "D", color=MODEL_COLOUR, markersize=6)
+    for marker, colour, words in (
+        ("o-", LINE_COLOUR, "the ego"),
+        ("o-", ORDINARY_COLOUR, "people in the same event"),
+        ("D", MODEL_COLOUR, "model of a human driver"),
+    ):
+        axes.plot([], [], marker, color=colour, linewidth=4, label=words)
+    axes.set(xscale="log", xlim=(start, max(ends) / FRACTION_BELOW), ylim=(len(rows) - 0.4, -0.6))
+    axes.set_yticks(range(len(rows)), [each.name for each in rows])
+    axes.xaxis.set_major_locator(LogLocator(numticks=7))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda rate, _: f"{rate:,.10g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("collisions per million km")
     axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=2, fontsize=11, frameon=False)
+    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)  # type: ignore[union-attr]
 
 
-def _draw_interval(axes: Axes, y: float, rate: float, ends: RateInterval, colour: str, start: float) -> None:
-    """Draw a rate with its interval; an upper end alone as an arrow out of the axis, without a point."""
+def _draw_interval(axes: Axes, y: float, value: float, ends: RateInterval, colour: str, start: float) -> None:
+    """Draw a value with its interval; an upper end alone as an arrow out of the axis."""
     low, high = ends
     if low > 0:
-        axes.plot([low, high], [y, y], color=colour, linewidth=4, alpha=0.5, solid_capstyle="butt")
-        axes.plot(rate, y, "o", color=colour, markersize=8)
-        return
-    axes.annotate("", (start, y), (high, y), arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 2})
-    axes.plot(high, y, "|", color=colour, markersize=14, markeredgewidth=2)
-    axes.annotate(f"below {format_rate(high)}", (high, y), (6, -4), textcoords="offset points", fontsize=11)
+        axes.plot([low, high], [y, y], color=colour, linewidth=9, alpha=0.35, solid_capstyle="butt")
+        axes.plot(value, y, "o", color=colour, markersize=8)
+    else:
+        axes.annotate("", (start, y), (high, y), arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 2})
+        axes.plot(high, y, "|", color=colour, markersize=14, markeredgewidth=2)
 
 
 CURVES_HEIGHT = 144
 """Height of the curves below the road of a film [pixels]."""
-LAST_FRAME_TICKS = 10
-"""Ticks for which the last picture stays."""
+SLOWED, LAST_FRAME = 2, 1.0
+"""Times as long as the drive that a film of it takes, and seconds for which its last picture stays."""
 MARKER: rendering.Colour = (200, 0, 150)
 """Line at the present moment in the curves."""
 
@@ -384,17 +464,13 @@ def draw_frames(drive: Drive) -> list[Image.Image]:
 @matplotlib.rc_context(DEFAULTS)
 def _draw_curves(drive: Drive) -> tuple[Image.Image, list[int], tuple[int, int]]:
     """Return the measure over time as a picture; the column of each moment in it, and the ends of the axes [pixels]."""
-    measure = drive.problem.world.measurement.measure
     figure = Figure(figsize=(rendering.FRAME_WIDTH / 100, CURVES_HEIGHT / 100), dpi=100)
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.3, 0.9, 0.62))
     draw_measure(axes, drive)
     axes.set_xlim(0.0, max(drive.problem.world.clock.dt, float(drive.time[-1])))
-    axes.set_ylabel(measure if isinstance(measure, str) else "measure")
-    axes.xaxis.label.set_fontsize(8)
-    axes.yaxis.label.set_fontsize(8)
-    axes.tick_params(labelsize=8)
-    axes.legend(fontsize=7, loc="upper right", frameon=False)
+    axes.set_xlabel("time [s], shown at half speed")
+    axes.legend(loc="upper right", ncols=3, frameon=False)
     show_literally(figure)
     canvas.draw()
     columns = axes.transData.transform(np.column_stack((drive.time, np.zeros(len(drive.time)))))[:, 0]
@@ -462,10 +538,10 @@ def _make_gif_palette() -> Image.Image:
 
 
 def save_gif(file: IO[bytes], shown: list[Image.Image], dt: float, every: int = 1) -> None:
-    """Write pictures, one for each tick of dt [s], as a moving one that shows one out of `every`; the last stays."""
-    tick, kept = round(1000 * dt), shown[:-1:every]
+    """Write pictures, one for each tick of dt [s], as a film at half speed of one out of `every`; the last stays."""
+    tick, kept = round(1000 * dt * SLOWED), shown[:-1:every]
     palette = _make_gif_palette()
     frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in (*kept, shown[-1])]
-    durations = [tick * every] * len(kept) + [tick * LAST_FRAME_TICKS]
+    durations = [tick * every] * len(kept) + [round(1000 * LAST_FRAME)]
     more: dict[str, Any] = {"append_images": frames[1:], "duration": durations, "loop": 0, "optimize": True}
     frames[0].save(file, format="GIF", save_all=True, **more)

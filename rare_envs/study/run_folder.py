@@ -37,18 +37,21 @@ STUDY = "study.json"
 """What was asked, by what command and with which versions."""
 STUDY_FORMAT = 1
 """Version of the fields of study.json; see docs/using_results.md."""
-RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
+RESULT, FAILURES, BLOCKS = "result.json", "failures.csv", "failures.npz"
 """Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
 EPISODES = "episodes.parquet"
 """All simulations."""
 REPORT = "report.html"
+ANSWER, CRASH_STRIP, SCATTER = "answer.png", "crash.png", "failures.png"
+"""The number; its most likely failure from above, and failures among ordinary traffic, if there are any."""
 SENSITIVITY, SEVERITY = "sensitivity.png", "severity.png"
-"""What p is sensitive to, if the question asks for it, and P[collision with delta-v > v], if there are collisions."""
+"""What p is sensitive to, if the question asks for it, and P[collision with delta-v > v], if some are above 1 m/s."""
+PICTURES = (ANSWER, CRASH_STRIP, SCATTER, SENSITIVITY, SEVERITY)
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """The same as of failures for scenarios on which the ego failed."""
 DIGESTED = (RESULT, FAILURES, BLOCKS, FAULTS, FAULT_BLOCKS, EPISODES)
 """Files that hold numbers of a run; pictures follow from them."""
-RESULT_FILES = (*DIGESTED, PLOT, SENSITIVITY, SEVERITY, STUDY, REPORT)
+RESULT_FILES = (*DIGESTED, *PICTURES, STUDY, REPORT)
 CRASH = tuple(
     "crash striking struck impact_speed closing_speed delta_v_striking delta_v_struck "
     "injury_risk_striking injury_risk_struck".split()

@@ -27,7 +27,7 @@ from rare_envs.startup import __version__
 from rare_envs.study import run_folder
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, output_folder, read_question
 from rare_envs.study.episodes import MAX_SHOWN, list_columns
-from rare_envs.study.plots import save_plot, saved_figure
+from rare_envs.study.plots import SEVERE, save_pictures, saved_figure
 from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question, note_question, read_about
 from rare_envs.study.report import Report
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
@@ -195,17 +195,17 @@ def write_run(folder: Path, report: Report) -> None:
     replace_text(folder / run_folder.RESULT, format_json(report.to_dict()) + "\n")
     nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in run_folder.CRASH[1:]))
     write_failures(folder, space, report.estimate.failures, [_list_crash(each) or nobody for each in report.crashes])
-    for name in (run_folder.FAULTS, run_folder.FAULT_BLOCKS, run_folder.SENSITIVITY, run_folder.SEVERITY):
+    for name in (run_folder.FAULTS, run_folder.FAULT_BLOCKS, *run_folder.PICTURES):
         (folder / name).unlink(missing_ok=True)
     if faults:
         x = np.stack([fault.x for fault in faults])
         _write_table(folder / run_folder.FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
-    save_plot(folder / run_folder.PLOT, report)
+    save_pictures(folder, report)
     if isinstance(report.sensitivity, samplers.Sensitivity):
-        with saved_figure(folder / run_folder.SENSITIVITY, 14, 4.5) as figure:
-            report.sensitivity.plot(list(figure.subplots(1, 2)))
-    if kinds.severity is not None:
-        with saved_figure(folder / run_folder.SEVERITY, 7, 4.5) as figure:
+        with saved_figure(folder / run_folder.SENSITIVITY, 3.6) as figure:
+            report.sensitivity.plot(figure.subplots())
+    if kinds.severity is not None and kinds.severity.largest_delta_v > SEVERE:
+        with saved_figure(folder / run_folder.SEVERITY, 3.6) as figure:
             kinds.severity.plot(figure.subplots())
 
 

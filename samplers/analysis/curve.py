@@ -6,7 +6,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from samplers.analysis.weighted import (
     MIN_UNITS,
@@ -30,6 +30,9 @@ from samplers.sample import Sample, add_unseen
 if TYPE_CHECKING:
     import pyarrow
     from matplotlib.axes import Axes
+
+WIDEST_BAND = 10.0
+"""Ratio of the ends of a band up to which `Curve.plot` shows it; wider ones say nothing to the eye."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -104,17 +107,25 @@ class Curve(Kept):
             f"{over.max():g}: {self.p.min():.3e} to {self.p.max():.3e}, {100 * self.confidence:g} % band>"
         )
 
+    @property
+    def _is_narrow(self) -> NDArray[np.bool_]:
+        """Where the ends of the band are within `WIDEST_BAND`, shape (k,); everywhere if they are nowhere."""
+        narrow = self.high <= WIDEST_BAND * self.low
+        return np.asarray(narrow | ~narrow.any())
+
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
-        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib."""
+        """Draw the curve and its band, p on a log scale, where the band is within a factor of 10; needs matplotlib."""
         with drawing_axes(ax) as axes:
             order = np.argsort(self.gammas)
-            t, p, low, high = (each[order] for each in (self.gammas, self.p, self.low, self.high))
+            t = np.where(self._is_narrow, self.gammas, np.nan)[order]
+            p, low, high = (each[order] for each in (self.p, self.low, self.high))
             floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
             axes.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
             axes.plot(t, np.where(p > 0, p, np.nan))
             axes.set_yscale("log")
             axes.set_xlabel(f"threshold {self.symbol}")
             axes.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
+            axes.set_title(f"How likely smaller values are, with a {100 * self.confidence:g} % band")
         return axes
 
 

@@ -233,7 +233,8 @@ class Exceedance(Curve):
             axes.collections[-1].set_label(f"sampling, {100 * self.confidence:g} % of all together")
             if self.base is not None:
                 positive = np.concatenate([self.p / 10, self.base.low])
-                order, floor = np.argsort(self.thresholds), positive[positive > 0].min(initial=1.0)
+                order = np.argsort(self.thresholds)
+                order, floor = order[self._is_narrow[order]], positive[positive > 0].min(initial=1.0)
                 low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
                 label = f"base distribution, {100 * self.base.confidence:g} % of all together"
                 axes.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)

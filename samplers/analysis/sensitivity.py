@@ -50,7 +50,8 @@ import numpy as np
 from samplers.analysis.reweight import find_fitted_base, log_density, require_base, reweight_to_refits
 from samplers.analysis.weighted import Reported, WeightedFailures, weigh_failures
 from samplers.method import EstimateData
-from samplers.problem import Distribution, FloatArray, needs_library
+from samplers.output import drawing_axes
+from samplers.problem import Distribution, FloatArray
 from samplers.sample import effective_number
 
 if TYPE_CHECKING:
@@ -188,36 +189,20 @@ class Sensitivity(Reported):
             lines.append(f"more recordings of {name} would narrow the interval most")
         return lines
 
-    def plot(self, axes: Sequence[Axes] | str | PathLike[str] | None = None) -> Sequence[Axes]:
-        """Draw importance of the columns and derivatives by the parameters as bars; needs matplotlib.
+    def plot(self, ax: Axes | str | PathLike[str] | None = None) -> Axes:
+        """Draw the importance of the parameters of x as bars; needs matplotlib.
 
         Args:
-            axes: Two axes to draw in, or the path of an image to write; None makes a figure of pyplot.
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
         """
-        size: Any = {"figsize": (12, 4.5), "layout": "constrained"}
-        with needs_library("matplotlib", "A drawing"):
-            if isinstance(axes, str | PathLike):
-                from matplotlib.figure import Figure
-
-                figure = Figure(**size)
-                drawn = self.plot(figure.subplots(1, 2))
-                figure.savefig(axes)
-                return drawn
-            if axes is None:
-                from matplotlib import pyplot
-
-                return self.plot(pyplot.subplots(1, 2, **size)[1])
-        left, right = axes
-        columns, parameters = self.columns[:SHOWN_PARAMETERS], self.parameters[:SHOWN_PARAMETERS]
-        left.barh([c.name for c in columns], [c.importance for c in columns], xerr=[c.error for c in columns])
-        left.set_xlabel("importance, share of -log p")
-        names, values = [f"{p.name}, {p.change_name}" for p in parameters], [p.d_log_p for p in parameters]
-        right.barh(names, values, xerr=[p.error for p in parameters])
-        right.axvline(0.0, color="black", linewidth=0.8)
-        right.set_xlabel("change of log p")
-        for each in (left, right):
-            each.invert_yaxis()
-        return left, right
+        shown = self.columns[:SHOWN_PARAMETERS]
+        with drawing_axes(ax) as axes:
+            names = [each.name.replace("_", " ") for each in shown]
+            shares, errors = ([100 * getattr(each, name) for each in shown] for name in ("importance", "error"))
+            axes.barh(names, shares, xerr=errors, color="0.6", capsize=3)
+            axes.set(xlabel="importance [% of -log p]", title="What matters for a failure", xlim=(0, None))
+            axes.invert_yaxis()
+        return axes
 
 
 def compute_sensitivity(

@@ -139,10 +139,8 @@ def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
             plots.draw_moment(axes, drive, t)
 
     def draw_measure(figure: Figure) -> None:
-        axes, measure = figure.subplots(), drive.problem.world.measurement.measure
+        axes = figure.subplots()
         plots.draw_measure(axes, drive)
-        axes.axvline(drive.time[drive.worst], color=plots.HIT_COLOUR, linewidth=1, label="worst moment")
-        axes.set_ylabel(text.name_measure(measure if isinstance(measure, str) else ""))
         axes.legend(frameon=False, fontsize=8)
 
     def draw_speeds(figure: Figure) -> None:
@@ -152,7 +150,7 @@ def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
     return [
         FigureOfPage(f"mode{number}-views", "From above; the ego is green", draw_views, (6.4, height)),
         FigureOfPage(f"mode{number}-measure", "The measure over time", draw_measure, (6.4, 2.2)),
-        FigureOfPage(f"mode{number}-speeds", "Speeds and gap over time", draw_speeds, (6.4, 2.8)),
+        FigureOfPage(f"mode{number}-speeds", "Speeds over time", draw_speeds, (6.4, 2.8)),
     ]
 
 
@@ -247,7 +245,8 @@ def render_page(
         share=text.format_share,
         sized_by_budget=SIZED_BY_BUDGET,
         figures={name: figure.to_svg() for name, figure in figures.items()},
-        passes_levels=drawings.passes_levels(result),
+        passes_levels=any(level["gamma"] != result["gamma"] for level in result.get("trace") or []),
+        severity=plots.list_severity(result.get("severity")),
         atlas=atlas,
         columns=[column for column in list_columns(problem.space) if column.shown],
         usual=find_ordinary_range(draw_shown(problem)),
@@ -286,7 +285,7 @@ def _make_figures(study: LoadedStudy, problem: DrivingProblem) -> dict[str, Figu
     failing, log_weights = _read_failing(study, [column.name for column in columns])
     weighted = ~np.isnan(log_weights)
     measure = text.name_measure(str(study.question.get("measure", "")))
-    figures = drawings.figures_of_result(study.result, log_weights[weighted], measure)
+    figures = drawings.figures_of_result(study.result, measure)
     if len(failing) and columns:
         weights = np.ones(len(failing))
         if weighted.any():

@@ -11,12 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from rare_envs.files import replace_file
-from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, draw_convergence, drawing, show_literally
+from rare_envs.study.plots import (
+    HIT_COLOUR,
+    LINE_COLOUR,
+    ORDINARY_COLOUR,
+    SEVERE,
+    draw_convergence,
+    drawing,
+    show_literally,
+)
 from rare_envs.study.text import Result
 from samplers.problem import FloatArray
 
@@ -76,40 +82,10 @@ class FigureOfPage:
         return figure
 
 
-TWO_PANELS_SIZE, PANEL_SIZE = (7.2, 3.2), (5.4, 3.2)
-"""Sizes of figures [inch]."""
-STACKED_SIZE = (4.2, 5.4)
-"""Size of two panels one below the other, for a narrow screen [inch]."""
+PANEL_SIZE = (5.4, 3.2)
+"""Size of a figure of one panel [inch]."""
 MAX_HISTOGRAMS = 12
 """Parameters that are shown, those that failures shift most."""
-
-
-def draw_levels(figure: Figure, result: Result, stacked: bool = False) -> None:
-    """Draw the share of each level's points below its threshold, and the threshold, where that changes."""
-    panels = _make_panels(figure, 2 if passes_levels(result) else 1, stacked)
-    trace = [level for level in result.get("trace") or [] if level["run"] == 0]
-    panels[0].bar(range(len(trace)), [level["p"] or 0.0 for level in trace], color=LINE_COLOUR)
-    panels[0].set(ylabel="share of the level's points with f ≤ threshold", ylim=(0, 1))
-    for thresholds in panels[1:]:
-        gammas = [np.nan if level["gamma"] is None else level["gamma"] for level in trace]
-        thresholds.plot(gammas, "o-", color=LINE_COLOUR, markersize=4)
-        thresholds.axhline(float(result["gamma"]), color=HIT_COLOUR, linewidth=1, label="gamma")
-        thresholds.set_ylabel("threshold of f")
-        thresholds.legend(frameon=False, fontsize=8)
-    for axes in panels:
-        axes.set_xlabel("level, iteration or batch")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def draw_weights(figure: Figure, log_weights: FloatArray, p: float, stacked: bool = False) -> None:
-    """Draw how much of p each failing simulation (k,) carries: a histogram, and p by the heaviest of them."""
-    histogram, share = _make_panels(figure, 2, stacked)
-    parts = np.sort(np.exp(log_weights) / p)[::-1]
-    shown = np.log10(parts[parts > 0])
-    histogram.hist(shown, bins=min(40, max(5, len(shown) // 5)) if np.ptp(shown) > 0 else 1, color=LINE_COLOUR)
-    histogram.set(xlabel="share of p in one simulation, log10", ylabel="failing simulations")
-    share.plot(np.arange(1, len(parts) + 1), 100 * np.cumsum(parts), color=LINE_COLOUR)
-    share.set(xlabel="heaviest failing simulations", ylabel="share of p [%]", xlim=(0, None), ylim=(0, 103))
 
 
 def draw_band(
@@ -146,51 +122,30 @@ def draw_parameters(
         failures: dict[str, Any] = {"color": HIT_COLOUR, "label": "failures", "histtype": "step", "linewidth": 1.5}
         axes.hist(ordinary[:, j], bins=bins, density=True, **usual)
         axes.hist(failing[:, j], bins=bins, density=True, weights=weights, **failures)
-        axes.set(xlabel=labels[j], yticks=[], ylabel="density")
+        axes.set(xlabel=labels[j].replace("_", " "), yticks=[])
+        axes.spines["left"].set_visible(False)
     lines, words = panels[0].get_legend_handles_labels()
     figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
 
 
-def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> dict[str, FigureOfPage]:
+def figures_of_result(result: Result, measure: str) -> dict[str, FigureOfPage]:
     """Return the figures that the numbers of a run allow, by name."""
-    two = passes_levels(result)
     curve, severity = result.get("curve"), result.get("severity")
-    drawn: dict[str, tuple[Any, ...]] = {
+    drawn: dict[str, tuple[str, Draw]] = {
         "convergence": (
             "The estimate on the way, and the result",
             lambda figure: draw_convergence(figure.subplots(), result),
-            PANEL_SIZE,
-        ),
-        "levels": (
-            "Levels of the run: shares and thresholds",
-            lambda figure: draw_levels(figure, result),
-            TWO_PANELS_SIZE if two else PANEL_SIZE,
-            (lambda figure: draw_levels(figure, result, stacked=True), STACKED_SIZE) if two else None,
-        ),
-    }
-    if len(log_weights):
-        p = float(np.exp(log_weights).sum())
-        drawn["weights"] = (
-            "Weights of the failing simulations",
-            lambda figure: draw_weights(figure, log_weights, p),
-            TWO_PANELS_SIZE,
-            (lambda figure: draw_weights(figure, log_weights, p, stacked=True), STACKED_SIZE),
         )
+    }
     if isinstance(curve, dict):
         gamma = float(result["gamma"])
         words = (f"threshold of f{f', {measure}' if measure else ''}", "P[f ≤ threshold]")
         caption = "Probability over the threshold, with its band"
-        drawn["curve"] = (caption, lambda figure: draw_band(figure, curve, "gammas", words, gamma), PANEL_SIZE)
-    if isinstance(severity, dict):
+        drawn["curve"] = caption, lambda figure: draw_band(figure, curve, "gammas", words, gamma)
+    if isinstance(severity, dict) and severity["largest_delta_v"] > SEVERE:
         over, axes = severity["curve"], ("delta-v [m/s]", "P[collision with a larger delta-v]")
-        caption = "Severity of the collisions"
-        drawn["severity"] = (caption, lambda figure: draw_band(figure, over, "delta_v", axes), PANEL_SIZE)
-    return {name: FigureOfPage(name, *about) for name, about in drawn.items()}
-
-
-def passes_levels(result: Result) -> bool:
-    """Return whether the run has thresholds other than gamma."""
-    return any(level["gamma"] != result["gamma"] for level in result.get("trace") or [])
+        drawn["severity"] = "Severity of the collisions", lambda figure: draw_band(figure, over, "delta_v", axes)
+    return {name: FigureOfPage(name, *about, PANEL_SIZE) for name, about in drawn.items()}
 
 
 def figure_of_parameters(
@@ -204,8 +159,3 @@ def figure_of_parameters(
 
     caption = "Parameters in ordinary traffic and among failures, the most shifted first"
     return FigureOfPage("parameters", caption, *make(3, 8.0), make(2, 4.6))
-
-
-def _make_panels(figure: Figure, n: int, stacked: bool) -> list[Axes]:
-    """Return n panels of a figure, side by side or one below the other."""
-    return list(figure.subplots(n if stacked else 1, 1 if stacked else n, squeeze=False).ravel())

@@ -89,9 +89,9 @@ def test_the_numbers_in_the_picture_by_hand():
     world, _ = set_up("rare_envs/CarFollowing-v0")
     episode = world.start(torch.tensor([[20.0, 15.0, 14.5], [20.0, 25.0, 30.0]]))
     assert caption(world, episode, 0.0) == (
-        " 0.0 s    ego 20.0 m/s    gap  14.5 m    TTC  2.9 s    f so far (ttc) 2.90"
+        " 0.0 s    ego 20.0 m/s    gap  14.5 m    time to collision  2.9 s    closest so far 2.9 s"
     )
-    assert "TTC   - " in caption(world, episode, 0.0, row=1)
+    assert caption(world, episode, 0.0, row=1) == " 0.0 s    ego 20.0 m/s    gap  30.0 m"
     world, _ = set_up("rare_envs/CarFollowing-v0", measure=lambda moment: moment.lead.gap)
     episode = world.start(torch.tensor([[20.0, 15.0, 14.5]]))
     assert caption(world, episode, None).endswith("f so far 14.50")

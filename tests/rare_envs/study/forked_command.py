@@ -94,7 +94,7 @@ def run_command(
         os.dup2(os.open(path, os.O_WRONLY), number)
     sys.argv = ["rare-envs", *words]
     DrivingProblem.tile = TILE
-    writing.save_plot = lambda path, report: None
+    writing.save_pictures = lambda path, report: None
     append = Journal.append
     Journal.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
     if kill_at:

@@ -162,7 +162,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("good")
     base = str(write_base(folder / "base.json", gap=30.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writing, "save_plot", lambda path, report: None)
+        patch.setattr(writing, "save_pictures", lambda path, report: None)
         asked = Question(env_id=FOLLOWING, base="us101-gap", gamma=3.0, horizon=2.0, method="mc", max_sim=600)
         evaluate.run_into(folder / "run", prepare(asked))
     corpus.add_run(folder / "run", folder / "corpus", most=1)
@@ -200,7 +200,7 @@ def here(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of it to damage, in the working directory; no pictures are drawn."""
     monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
     monkeypatch.setattr(html_report, "encode_clip", lambda drive: "")
-    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_pictures", lambda path, report: None)
     shutil.copytree(good, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path

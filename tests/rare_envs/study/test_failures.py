@@ -134,7 +134,7 @@ def report() -> Report:
 def test_each_failure_of_the_list_has_its_crash_and_shares_add_up(
     report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rare_envs.study.writing.save_plot", lambda *_: None)  # pictures have their own tests
+    monkeypatch.setattr("rare_envs.study.writing.save_pictures", lambda *_: None)  # pictures have their own tests
     write_run(tmp_path, report)
     rows = list(csv.DictReader((tmp_path / "failures.csv").read_text().splitlines()))
     result = json.loads((tmp_path / "result.json").read_text())

@@ -268,7 +268,7 @@ ASKED = Question(
 @pytest.fixture
 def faulty(here: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> Path:
     (here / "faulty.py").write_text(FAULTY)
-    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_pictures", lambda path, report: None)
     return here
 
 

@@ -26,7 +26,7 @@ def folder(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return path
 
 
-SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
+SECTIONS = ("warnings", "answer", "convergence", "levels", "curve", "parameters", "kinds", "atlas", "made")
 """Ids of the sections of the page, in their order."""
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 
@@ -112,7 +112,7 @@ def test_recorded_events_and_figures_as_files(
     text = out.read_text(encoding="utf-8")
     assert "nearest recorded" in text and "standard deviations per parameter away" in text
     names = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert names >= {"convergence.svg", "weights.svg", "curve.svg", "parameters.svg", "mode1-views.svg"}
+    assert names >= {"convergence.svg", "curve.svg", "parameters.svg", "mode1-views.svg"}
     assert all((tmp_path / "figures" / name).read_text().lstrip().startswith("<?xml") for name in names)
 
 

@@ -17,12 +17,13 @@ from rare_envs.study import Question, Report, prepare, run
 from rare_envs.study.arguments import BadInput
 from rare_envs.study.plots import (
     MARKER,
-    MOMENTS,
+    SHOWN_SECONDS,
+    draw_answer,
     draw_convergence,
-    draw_drive,
     draw_frames,
-    explain_no_failure,
-    save_plot,
+    draw_measure,
+    list_severity,
+    one_in,
     write_film,
 )
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
@@ -89,25 +90,36 @@ def test_the_folder_of_a_run_holds_what_was_printed_and_a_picture(cli: Cli, risk
     out = tmp_path / "runs" / "one"
     result = cli(*SMALL, "--base", risky, "--out", out, "--json")
     assert result.exit_code == 0
-    tables = ["episodes.parquet", "failures.csv", "plot.png", "result.json", "severity.png", "study.json"]
-    assert sorted(path.name for path in out.iterdir()) == tables
+    pictures = ["answer.png", "crash.png", "failures.png", "severity.png"]
+    tables = ["episodes.parquet", "failures.csv", "result.json", "study.json"]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*pictures, *tables])
     assert json.loads((out / "result.json").read_text()) == json.loads(result.stdout)
-    picture = imread(out / "plot.png")[..., :3]
-    assert picture.shape[0] > 500 and picture.shape[1] > 1500
-    for part in np.array_split(picture, 3, axis=1):  # each of the three drawings has ink and colour
-        assert 0.01 < np.mean(part.min(axis=2) < 0.9) < 0.6
-        assert np.mean(np.ptp(part, axis=2) > 0.2) > 0.001
+    for name in pictures:  # of the width of a page, with ink, and what is of the ego in green
+        picture = imread(out / name)[..., :3]
+        assert picture.shape[1] == 720 and 0.01 < np.mean(picture.min(axis=2) < 0.9) < 0.6
+        green = (picture[..., 1] > picture[..., 0] + 0.2) & (picture[..., 1] > picture[..., 2] + 0.2)
+        assert green.mean() > 0.001 or name == "failures.png"
+    severity = json.loads(result.stdout)["severity"]
+    assert list_severity(severity)[0].km_h == 0.0 and len(list_severity(severity)) == 3
 
 
-def test_the_legend_says_which_vehicle_is_which() -> None:
-    problem = rare_envs.DrivingProblem(CUT_IN, horizon=3.0)
-    axes = list(Figure().subplots(MOMENTS + 1))
-    draw_drive(axes, drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0]))
-    speeds = [f"speed of {label}" for label in problem.world.scenario.labels]
-    assert [text.get_text() for text in axes[-1].get_legend().get_texts()] == [*speeds, "gap to the vehicle ahead"]
+def test_where_nobody_closes_in_the_curve_has_a_gap_and_not_the_cap() -> None:
+    """30 m behind a vehicle as fast as the ego: no time to collision, until the ego is told to be faster."""
+    problem = rare_envs.DrivingProblem(FOLLOWING, ego=Coasting())
+    for speed, crashes in ((10.0, True), (20.0, False)):
+        axes = Figure().subplots()
+        drive = drive_again(problem, np.array([20.0, speed, 60.0]))
+        draw_measure(axes, drive)
+        alone = np.asarray(axes.get_lines()[0].get_ydata())
+        expected = 6.0 - drive.time if crashes else np.full(len(drive.time), np.inf)
+        shown = (expected <= SHOWN_SECONDS) & (expected > 0.05)
+        np.testing.assert_array_equal(np.isfinite(alone), shown)
+        np.testing.assert_allclose(alone[shown], expected[shown], atol=1e-3)
+        words = {str(line.get_label()) for line in axes.get_lines()}
+        assert axes.get_ylim() == (0.0, SHOWN_SECONDS) and ("crash" in words) is crashes
 
 
-def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> None:
+def test_a_run_without_a_failure_shows_how_its_bound_falls() -> None:
     report = run(prepare(Question(env_id=FOLLOWING, base="i24", ego="idm", max_sim=200, method="mc")))
     high = report.estimate.interval[1]
     axes = Figure().subplots()
@@ -116,9 +128,9 @@ def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> No
     spent, bound = line.get_data()
     assert [spent[0], bound[0], spent[-1], bound[-1]] == pytest.approx([1.0, 1.0, 200.0, high])
     np.testing.assert_allclose(bound[bound < 1.0] * spent[bound < 1.0], 200.0 * high, rtol=1e-6)
-    assert f"below {high:.1e} (95 %)" in explain_no_failure(report)
-    save_plot(tmp_path / "plot.png", report)
-    assert (tmp_path / "plot.png").stat().st_size > 20_000
+    figure = Figure(layout="constrained")
+    draw_answer(figure.subplots(), report)
+    assert figure.axes[0].get_title().startswith(f"Collision: fewer than {one_in(high)} scenarios (95 %)")
 
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)

@@ -59,7 +59,7 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
     tmp_path: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped in the second scenario: nothing that was simulated is simulated again, and no journal is left."""
-    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_pictures", lambda path, report: None)
     monkeypatch.setattr(DrivingProblem, "tile", 30)
     attempt, made, most = DrivingProblem.attempt, [0], [150]
 

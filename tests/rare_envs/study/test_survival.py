@@ -72,7 +72,7 @@ def frail(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (here / "frail.py").write_text(FRAIL)
     monkeypatch.syspath_prepend(str(here))
     monkeypatch.setattr(DrivingProblem, "tile", 200)
-    monkeypatch.setattr(writing, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(writing, "save_pictures", lambda path, report: None)
     return here
 
 

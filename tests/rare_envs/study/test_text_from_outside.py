@@ -40,7 +40,7 @@ def test_a_run_of_a_file_with_a_strange_name_is_shown_and_kept(tmp_path: Path, m
         result = CliRunner().invoke(app, list(words))
         assert isinstance(result.exception, SystemExit | None), repr(result.exception)
         assert_plain(result.output)
-    assert (folder / "plot.png").exists()
+    assert (folder / "answer.png").exists()
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert_plain(page)
     assert SHOWN.replace("<b>", "&lt;b&gt;") in page
@@ -51,11 +51,11 @@ def test_a_run_of_a_file_with_a_strange_name_is_shown_and_kept(tmp_path: Path, m
 def test_a_picture_that_cannot_be_drawn_is_a_warning(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with saved_figure(tmp_path / "good.png", 2, 2) as figure:
+        with saved_figure(tmp_path / "good.png", 2) as figure:
             figure.suptitle(NAME + "漢字 $")
             figure.subplots().set(xlabel=NAME, yscale="log")
     assert (tmp_path / "good.png").exists()
     with pytest.warns(UserWarning, match=r"bad.png is missing, it cannot be drawn: ArithmeticError: \\x1b"):
-        with saved_figure(tmp_path / "bad.png", 2, 2):
+        with saved_figure(tmp_path / "bad.png", 2):
             raise ArithmeticError("\x1b")
     assert not (tmp_path / "bad.png").exists()

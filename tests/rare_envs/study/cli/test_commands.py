@@ -28,7 +28,7 @@ from rare_envs.study.cli.listing import TITLES
 from rare_envs.study.cli.runs import FAILS
 from rare_envs.study.corpus import read_corpus
 from rare_envs.study.ego_check import VERDICTS
-from rare_envs.study.plots import CURVES_HEIGHT, LAST_FRAME_TICKS
+from rare_envs.study.plots import CURVES_HEIGHT
 from rare_envs.study.run_folder import read_failures
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
@@ -193,7 +193,7 @@ def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> Non
     with Image.open("clip.gif") as film:
         assert film.size == (800, 160 + 48 + CURVES_HEIGHT)
         length = sum(frame.info["duration"] for frame in ImageSequence.Iterator(film))
-    assert length == pytest.approx(1000 * answer["seconds"] + 100 * LAST_FRAME_TICKS, abs=1)  # equal frames are one
+    assert length == pytest.approx(2000 * answer["seconds"] + 1000, abs=1)  # half speed, and the end stays 1 s
     words = cli("replay", run, "--out", "worst.png").stdout
     n_found = json.loads((run / "result.json").read_text())["n_failures"]
     for said in (f"Failure 0 of {n_found} found in ", "ego_speed", "the ego into the lead (rear_end", "worst.png"):
