@@ -77,10 +77,8 @@ def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) 
 
 MOST_MODES = 8
 """Modes that are shown with pictures; the others have a row in the table."""
-CLIP_WIDTH, CLIP_EVERY = 560, 2
-"""Width of a clip [pixels], and of how many ticks it shows one."""
-CLIP_SECONDS = 5.0
-"""Seconds of a clip, the last ones up to the end of the drive."""
+CLIP_WIDTH, CLIP_SECONDS = 560, 3.0
+"""Width of a clip [pixels], and seconds that it shows, the last ones up to the end of the drive."""
 
 
 class AtlasEntry(NamedTuple):
@@ -159,7 +157,7 @@ def encode_clip(drive: Drive) -> str:
     dt, buffer = drive.problem.world.clock.dt, io.BytesIO()
     frames = plots.draw_frames(drive)[-max(round(CLIP_SECONDS / dt), 2) :]
     size = (CLIP_WIDTH, round(frames[0].height * CLIP_WIDTH / FRAME_WIDTH))
-    plots.save_gif(buffer, [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames], dt, CLIP_EVERY)
+    plots.save_gif(buffer, [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames], dt)
     return f"data:image/gif;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 

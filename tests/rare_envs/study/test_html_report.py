@@ -78,7 +78,7 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     for name in ("ego_speed [m/s]", "lead_speed [m/s]", "gap [m]"):
         assert name in text
     assert f"rare-envs replay {folder} --failure {result['modes'][0]['failure']}" in text
-    for label in ("simulations", "delta-v [m/s]", "time [s]", "ttc [s]", "share of p [%]"):
+    for label in ("simulations", "delta-v [m/s]", "time [s]", "ttc [s]", "collision [s]"):
         assert label in text, label  # axes with units, as text
     assert len(re.findall(r"<svg[^>]*aria-label=\"[^\"]+\"", text)) >= 8
 

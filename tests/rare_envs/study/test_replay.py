@@ -97,14 +97,14 @@ def test_the_folder_of_a_run_holds_what_was_printed_and_a_picture(cli: Cli, risk
     for name in pictures:  # of the width of a page, with ink, and what is of the ego in green
         picture = imread(out / name)[..., :3]
         assert picture.shape[1] == 720 and 0.01 < np.mean(picture.min(axis=2) < 0.9) < 0.6
-        green = (picture[..., 1] > picture[..., 0] + 0.2) & (picture[..., 1] > picture[..., 2] + 0.2)
+        green = (picture[..., 1] > picture[..., 0] + 0.1) & (picture[..., 1] > picture[..., 2] + 0.1)
         assert green.mean() > 0.001 or name == "failures.png"
     severity = json.loads(result.stdout)["severity"]
     assert list_severity(severity)[0].km_h == 0.0 and len(list_severity(severity)) == 3
 
 
 def test_where_nobody_closes_in_the_curve_has_a_gap_and_not_the_cap() -> None:
-    """30 m behind a vehicle as fast as the ego: no time to collision, until the ego is told to be faster."""
+    """60 m behind, closing at 10 m/s: from 5 s on a curve, to the crash; at equal speeds there is none."""
     problem = rare_envs.DrivingProblem(FOLLOWING, ego=Coasting())
     for speed, crashes in ((10.0, True), (20.0, False)):
         axes = Figure().subplots()
@@ -112,9 +112,9 @@ def test_where_nobody_closes_in_the_curve_has_a_gap_and_not_the_cap() -> None:
         draw_measure(axes, drive)
         alone = np.asarray(axes.get_lines()[0].get_ydata())
         expected = 6.0 - drive.time if crashes else np.full(len(drive.time), np.inf)
-        shown = (expected <= SHOWN_SECONDS) & (expected > 0.05)
+        shown = (expected <= SHOWN_SECONDS) & (np.arange(len(expected)) < len(expected) - crashes)
         np.testing.assert_array_equal(np.isfinite(alone), shown)
-        np.testing.assert_allclose(alone[shown], expected[shown], atol=1e-3)
+        np.testing.assert_allclose(alone[shown], expected[shown], atol=2e-3)  # gaps are at least 1 cm
         words = {str(line.get_label()) for line in axes.get_lines()}
         assert axes.get_ylim() == (0.0, SHOWN_SECONDS) and ("crash" in words) is crashes
 
