@@ -354,7 +354,7 @@ def draw_measure(axes: Axes, drive: Drive) -> None:
     axes.axvline(drive.time[drive.worst], **crash)
     axes.set(xlabel="time [s]", ylabel=SAID.get(name, name_measure(name)))
     if seconds:
-        axes.set_ylim(min(0.0, *axes.get_ylim()), top)
+        axes.set_ylim(float(np.nanmin(drive.f_alone[alive], initial=0.0)), top)
 
 
 SAID = {"ttc": "time to\ncollision [s]", "lidar_ttc": "time to\ncollision [s]", "clearance": "distance [m]"}
