@@ -27,7 +27,7 @@ from rare_envs.study.question import (
     open_run,
 )
 from rare_envs.study.replay import find_failure
-from rare_envs.study.run_folder import EPISODES, FAILURES, PLOT, RESULT, RESULT_FILES, STUDY, load_study
+from rare_envs.study.run_folder import ANSWER, EPISODES, FAILURES, RESULT, RESULT_FILES, STUDY, load_study
 from rare_envs.study.writing import begin_journal
 from tests.rare_envs.study.refusals import FOLLOWING
 
@@ -187,7 +187,7 @@ def test_nothing_is_written_through_the_links_of_a_folder_nor_taken_from_its_mat
         (tmp_path / "half" / name).symlink_to(outside / "precious")
     resume(tmp_path / "half")
     assert (outside / "precious").read_text() == "precious"
-    assert not any((tmp_path / "half" / name).is_symlink() for name in (RESULT, FAILURES, EPISODES, STUDY, PLOT))
+    assert not any((tmp_path / "half" / name).is_symlink() for name in (RESULT, FAILURES, EPISODES, STUDY, ANSWER))
     (received / "figures").symlink_to(outside / "figures")
     with pytest.raises(BadInput, match="figures' is a link, and nothing is written through one: remove it"):
         write_html_report(received, figures="svg")
