@@ -339,7 +339,7 @@ def _fit_to_run(hyperparameters: Hyperparameters, num_envs: int, steps: int) -> 
 
 def _prepare_target(out: Path) -> Path:
     """Return the file to write, with its folder made; a ValueError if it cannot be written."""
-    target = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
+    target = out if out.suffix == ".zip" or not out.name else out.with_name(f"{out.name}.zip")
     for folder in filter(Path.is_dir, (out, target)):
         raise ValueError(f"Expected a file to write, got the folder {str(folder)!r}; name a .zip.")
     try:

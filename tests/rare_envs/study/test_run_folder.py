@@ -16,6 +16,7 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.study import Question, episodes, prepare, run_folder, run_into
+from rare_envs.study.arguments import UnwrittenResults
 from rare_envs.study.episodes import EpisodeTable, digest_scenarios, name_columns
 from rare_envs.study.evaluate import resume
 from samplers.evaluate import Simulated
@@ -177,8 +178,9 @@ def test_a_table_that_cannot_be_written_does_not_end_the_run(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(episodes, "_join_batches", refuse)
-    report = run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=300)))
-    assert report.estimate.n_sim == 300
+    with pytest.raises(UnwrittenResults, match="300 simulations are kept; go on with: rare-envs resume") as stopped:
+        run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=300)))
+    report = stopped.value.report
     assert "episodes.parquet could not be written: No space left on device" in report.notes
     assert sorted(path.name for path in (tmp_path / "run").glob("*episodes*")) == []
     study = rare_envs.load_study(tmp_path / "run")
