@@ -16,6 +16,7 @@ from matplotlib.axis import Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Affine2D
@@ -64,7 +65,7 @@ STYLE: Any = {
     **DEFAULTS,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.prop_cycle": matplotlib.cycler(color=[LINE_COLOUR, "#7a7a7a", MODEL_COLOUR]),
+    "axes.prop_cycle": cycler(color=[LINE_COLOUR, "#7a7a7a", MODEL_COLOUR]),
 }
 """Settings of matplotlib for every picture, whatever a matplotlibrc says, which may lie in the folder of somebody else.
 Each is a `Figure` of its own, without pyplot: no window, no global state, whatever backend the user has."""
@@ -186,13 +187,13 @@ def draw_answer(axes: Axes, report: Report) -> None:
     event = "Collision" if collides else f"f ≤ {estimate.gamma:g}"
     if estimate.p > 0:
         most, least = one_in(widest[1]), one_in(widest[0]) if widest[0] > 0 else ""
-        ends = f"{least} to {most}" if least else f"at most {most}"
-        said = f"{event}: {one_in(estimate.p)} scenarios\n{level}: {ends}"
+        said = f"{event}: {one_in(estimate.p)} scenarios\n{level}: "
+        said += f"{least} to {most}" if least else f"at most {most}"
     else:
         said = f"{event}: fewer than {one_in(high)} scenarios ({level})\n"
         said += f"no failure counts in {estimate.n_sim:,} simulations"
     axes.set_title(said, fontweight="bold")
-    axes.figure.legend(loc="outside lower center", ncols=2, frameon=False)  # type: ignore[union-attr]
+    axes.figure.legend(loc="outside lower center", ncols=2, frameon=False)
 
 
 def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
@@ -264,7 +265,7 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
         if abs(shift[place]) > SHIFTED
     ]
     axes.set_title(f"Failures: {', '.join(words) or 'much as ordinary traffic'}", fontweight="bold")
-    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)  # type: ignore[union-attr]
+    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)
 
 
 class SeverityRow(NamedTuple):
@@ -345,14 +346,15 @@ def draw_measure(axes: Axes, drive: Drive) -> None:
     seconds = getattr(MEASURES.get(name), "unit", "") == "s"
     top = SHOWN_SECONDS if seconds else np.inf
     alive = drive.time < (drive.time[-1] if drive.collided else np.inf)  # not the value that stands for a collision
-    for values, words, style in (
-        (drive.f_alone, "this moment", {"color": "#777777", "linewidth": 1}),
-        (drive.f_so_far, "closest so far", {"color": "black", "linewidth": 1.5, "drawstyle": "steps-post"}),
+    for values, words, colour, steps in (
+        (drive.f_alone, "this moment", "#777777", "default"),
+        (drive.f_so_far, "closest so far", "black", "steps-post"),
     ):
-        axes.plot(drive.time, np.where(alive & (values <= top), values, np.nan), label=words, **style)
-    crash: Any = {"color": HIT_COLOUR, "linewidth": 1.5, "label": "crash" if drive.collided else "closest"}
-    axes.axvline(drive.time[drive.worst], **crash)
-    axes.set(xlabel="time [s]", ylabel=SAID.get(name, name_measure(name)))
+        shown = np.where(alive & (values <= top), values, np.nan)
+        axes.plot(drive.time, shown, color=colour, linewidth=1.5, drawstyle=steps, label=words)
+    axes.axvline(drive.time[drive.worst], color=HIT_COLOUR, label="crash" if drive.collided else "closest")
+    last = max(drive.problem.world.clock.dt, float(drive.time[-1]))
+    axes.set(xlabel="time [s]", ylabel=SAID.get(name, name_measure(name)), xlim=(0.0, last))
     if seconds:
         axes.set_ylim(float(np.nanmin(drive.f_alone[alive], initial=0.0)), top)
 
@@ -424,7 +426,7 @@ def draw_rates(axes: Axes, rows: Sequence[RateRow]) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("collisions per million km")
     axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.3)
-    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)  # type: ignore[union-attr]
+    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)
 
 
 def _draw_interval(axes: Axes, y: float, value: float, ends: RateInterval, colour: str, start: float) -> None:
@@ -468,7 +470,6 @@ def _draw_curves(drive: Drive) -> tuple[Image.Image, list[int], tuple[int, int]]
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.3, 0.9, 0.62))
     draw_measure(axes, drive)
-    axes.set_xlim(0.0, max(drive.problem.world.clock.dt, float(drive.time[-1])))
     axes.set_xlabel("time [s], shown at half speed")
     axes.legend(loc="upper right", ncols=3, frameon=False)
     show_literally(figure)

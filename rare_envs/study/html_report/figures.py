@@ -24,6 +24,7 @@ from rare_envs.study.plots import (
     show_literally,
 )
 from rare_envs.study.text import Result
+from samplers.analysis.curve import WIDEST_BAND
 from samplers.problem import FloatArray
 
 WIDE_ON_PHONES = 420
@@ -94,6 +95,8 @@ def draw_band(
     """Draw p of a curve and its simultaneous band over one of its entries, p on a log scale; words are on the axes."""
     axes = figure.subplots()
     over, p, low, high = (np.array(curve[name], dtype=float) for name in (axis, "p", "low", "high"))
+    narrow = high <= WIDEST_BAND * low
+    over = np.where(narrow | ~narrow.any(), over, np.nan)  # as far as the band says something to the eye
     floor = p[p > 0].min(initial=1.0) / 10  # an end of 0 has no place on a log scale
     band = f"{100 * float(curve['confidence']):g} % band, for all thresholds together"
     ends = (np.maximum(low, floor), np.maximum(high, floor))
