@@ -177,6 +177,7 @@ def draw_answer(axes: Axes, report: Report) -> None:
     if behind != "simulation":
         bar: Any = {"color": LINE_COLOUR, "linewidth": 9, "label": "simulation alone"}
         axes.plot([max(low, start), high], [0, 0], solid_capstyle="butt", **bar)
+        axes.plot(estimate.p, 0, "o", color="black", markersize=6)
     axes.set(xscale="log", xlim=(start, top), ylim=(-1, 1), yticks=[])
     axes.spines["left"].set_visible(False)
     axes.xaxis.set_major_locator(LogLocator(numticks=5))

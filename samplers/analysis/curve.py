@@ -121,7 +121,7 @@ class Curve(Kept):
             p, low, high = (each[order] for each in (self.p, self.low, self.high))
             floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
             axes.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
-            axes.plot(t, np.where(p > 0, p, np.nan))
+            axes.plot(t, np.where(p > 0, p, np.nan), marker="o" if len(t) == 1 else "")  # a line has two points
             axes.set_yscale("log")
             axes.set_xlabel(f"threshold {self.symbol}")
             axes.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
