@@ -1,8 +1,8 @@
-"""Output: results as values of JSON, in files and as tables, for notebooks and drawings; reading a file runs no code.
+"""Output: results in words, as values of JSON, in files and as tables, for notebooks and drawings.
 
-A file (safetensors for arrays, JSON for the rest) holds one object of the classes that `register_stored` names, with
-objects of these classes inside. A value is written as JSON writes it; numbers that JSON has not, arrays, tuples and
-objects are written as {kind: content} with one of the kinds of `_encode`.
+Reading a file runs no code. A file (safetensors for arrays, JSON for the rest) holds one object of the classes that
+`register_stored` names, with objects of these classes inside. A value is written as JSON writes it; numbers that JSON
+has not, arrays, tuples and objects are written as {kind: content} with one of the kinds of `_encode`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ import dataclasses
 import json
 import math
 import os
+import re
 import secrets
 import stat
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -21,6 +23,7 @@ from html import escape
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
@@ -227,6 +230,110 @@ def arrow_table(
         column[rows] = values
         table[name] = pa.array(column, mask=unknown)
     return pa.table(table)
+
+
+# In words
+
+FACTS: Mapping[str, str] = MappingProxyType(
+    {
+        "p": "{p}{odds}; {sure} interval {low} to {high}",
+        "p without a lower limit": "{p}{odds}; below {high} ({sure}), no lower limit",
+        "nothing failed": "none in {n} simulations; below {high} ({sure})",
+        "failures of the search alone": "none that counts in p, {found} in the search; below {high} ({sure})",
+        "limited by simulations": "{n} simulations{few}; more of them (max_sim) help",
+        "limited by events": "{events}, not simulations{exact}; more recordings help",
+        "limited by both": "{events} ({share}) and {n} simulations ({rest}){few}{exact}",
+        "too few in strata": ", too few in {strata}",
+        "if the model is exact": "; {low} to {high} if the {model} is exact",
+        "error not known": "error of the {model}: {reason}",
+        "may miss": "failures of a kind rarer than {unseen} ({sure}) that no simulation came near",
+        "may miss anything": "failures of a kind that no simulation came near, however likely",
+        "warnings": "{first} ({more} more)",
+        "next": "{command} ({what})",
+        "details": "method, c.o.v., all intervals, remarks",
+        "report": "crash clips, parameters, all intervals",
+        "rate": "{rate}; people in {noun} {people}",
+        "rate of all": "{rate}; people in the same events {people}",
+        "rate of one": "{noun} {rate}; people {people}; human driver model {model}",
+        "serious injuries": "{rate}, serious ones (MAIS 3+)",
+        "calibrated": "human driver model {model}, within a factor {factor} of people's interval",
+        "not calibrated": "not calibrated: human driver model {model}, {far}",
+        "not measured": "not calibrated: human driver model not measured in {traffic}",
+        "crash": "{who} runs into {whom}, {speed} m/s at contact, delta-v {delta_v} m/s",
+        "likeliest": "{kinds}; most likely: {what}",
+        "usual": "every parameter usual",
+        "unusual": "{name} {value} {unit} (usually {low} to {high})",
+        "passes": "{what} below {limit} ({sure} confidence, upper limit {high})",
+        "fails": "{what} above {limit} ({sure} confidence, lower limit {low})",
+        "undecided": "{what} {low} to {high} ({sure} confidence), limit {limit}",
+        "too few simulations": "more simulations are needed",
+        "too few events": "more recordings are needed, not simulations",
+        "if exact": "it {decision} if the base distribution is exact",
+        "gate": "GATE {decision} (exit code {code}): {why}",
+    }
+)
+"""The wording of each fact of an answer, on the terminal, in notebooks, in reports and as `text` in JSON."""
+WIDTH, LABEL, MOST_LINES = 98, 13, 12
+"""Columns of an answer, those of the names of its facts, and lines."""
+LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
+"""Numbers from which whole ones are shown, and below which powers of ten: alone, and beside one above `SMALL`."""
+Row = tuple[str, str]
+"""A fact of an answer: its name, and its text."""
+
+
+def say(fact: str, **values: object) -> str:
+    """Return a fact of `FACTS` with its values."""
+    return FACTS[fact].format(**values)
+
+
+def fold_rows(rows: Sequence[Row], most: int = MOST_LINES) -> list[str]:
+    """Return facts as lines, at most so many: the longest texts are cut, and end with "...".
+
+    A word that is longer than a line is not broken, nor a command whose spaces are no-break ones, for pasting.
+    """
+    label = max([LABEL, *(len(name) + 2 for name, _ in rows)])
+    width = WIDTH - label
+    texts = (re.sub("[ \n]+", " ", text) for _, text in rows)
+    folded = [textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) for text in texts]
+    while sum(map(len, folded)) > most and max(map(len, folded)) > 1:
+        longest = max(reversed(folded), key=len)
+        longest.pop()
+        longest[-1] = f"{textwrap.shorten(longest[-1].removesuffix(' ...'), width - 4, placeholder='')} ..."
+    return [
+        f"{'' if number else name:<{label}}{line}".replace("\xa0", " ")
+        for (name, _), lines in zip(rows, folded, strict=True)
+        for number, line in enumerate(lines)
+    ]
+
+
+def unfold_rows(lines: Sequence[str]) -> list[Row]:
+    """Return the facts of which `fold_rows` made these lines."""
+    rows: list[Row] = []
+    for line in lines:
+        name, _, text = line.partition("  ")
+        if not name and rows:
+            rows[-1] = (rows[-1][0], f"{rows[-1][1]} {text.strip()}")
+        else:
+            rows.append((name, text.strip()))
+    return rows
+
+
+def format_alike(*values: float) -> list[str]:
+    """Return numbers with two digits, all as decimals or all with powers of ten."""
+    sizes = [value for value in values if value > 0 and math.isfinite(value)]
+    least = SMALL if max(sizes, default=SMALL) < SMALL else SMALL_BESIDE
+    decimal = all(value >= least for value in sizes)
+
+    def write(value: float) -> str:
+        if value <= 0 or not math.isfinite(value):
+            return f"{value:g}"
+        if not decimal:
+            return f"{value:.1e}"
+        if value >= LARGE:
+            return f"{round(value, 1 - math.floor(math.log10(value))):,.0f}"
+        return f"{value:#.2g}".rstrip(".")
+
+    return [write(value) for value in values]
 
 
 # For people

@@ -13,20 +13,24 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.base_error import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve, lowest_known_threshold
-from samplers.analysis.gate import Pilot, Verdict, judge_estimate
+from samplers.analysis.gate import Pilot, Verdict, find_ends, judge_estimate
 from samplers.analysis.reweight import Reweighted, reweight_estimate
 from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.analysis.weighted import Share, require_sample, split_by_kind
 from samplers.method import Choice, EstimateData, Outcome, Part, Stepping
 from samplers.output import (
     Kept,
+    Row,
     StoredMethod,
     arrow_table,
     drawing_axes,
+    fold_rows,
+    format_alike,
     indent_lines,
     is_stored,
     read_object,
     register_stored,
+    say,
     to_json_value,
 )
 from samplers.problem import Distribution, FloatArray
@@ -49,6 +53,13 @@ if TYPE_CHECKING:
 
 PLOTTED_THRESHOLDS = 60
 """Thresholds of the curve that `Estimate.plot` draws."""
+
+NEGLIGIBLE = 0.1
+"""Share of the squared width of an interval below which its source does not limit it."""
+NAMED_STRATA = 2
+"""Strata without enough failures that are named."""
+LEAST_ODDS = 1e-12
+"""Probability from which on it is also written as "1 in n"."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -282,6 +293,23 @@ class Estimate(EstimateData, Kept):
         return f"<Estimate {self.headline} {ends}, {self.n_sim:,} simulations, {self.method.name}, {ended}>"
 
     def __str__(self) -> str:
+        more = ("Details", say("next", command="result.details()", what=say("details")))
+        base = self.base_uncertainty
+        warnings = list_warnings([*self.warnings, *([] if base is None else base.warnings)])
+        return "\n".join(fold_rows([*list_facts(self), *warnings, more]))
+
+    def details(self) -> str:
+        """Return everything that is known of p, in a text: all intervals, c.o.v., gain, method, remarks, warnings.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+            >>> print(samplers.estimate(problem, "mc", seed=0, max_sim=10_000).details())
+            P[f <= 0] = 2.370e-02
+              95 % interval [2.081e-02, 2.687e-02], c.o.v. 0.0642
+              10,000 simulations, gain over Monte Carlo 1; mc, seed 0, converged; 237 failing points
+              a failure region that no draw met: below 3.0e-04 (10,000 base draws, 95 % confidence)
+        """
         (low, high), looks = self.interval, self.sequence
         gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
         cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
@@ -379,6 +407,7 @@ class Estimate(EstimateData, Kept):
         uncertainty, points = self.base_uncertainty, self.failures
         data = {name: getattr(self, name) for name in plain.split()} | {
             "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),
+            "text": str(self),
             "warnings": self.warnings,
             "choice": self.choice,
             "final_draws": None if self.sample is None else self.sample.n_units,
@@ -428,6 +457,76 @@ def without_base(estimate: _EstimateT) -> _EstimateT:
         ensemble_run=None if further is None else without_base(further),
         refit_ratios=[],
     )
+
+
+def list_facts(
+    estimate: Estimate, name: str = "", noun: str = "", model: str = "base distribution", left_out: str = ""
+) -> list[Row]:
+    """Return p with its widest interval, what limits that, and what the run may have missed, each in a sentence.
+
+    `name` is that of p, by default P[f <= gamma]; `noun` is what p is a share of, in the plural; `model` what x is
+    drawn from; `left_out` the errors that the interval leaves out.
+    """
+    base, sure = estimate.base_uncertainty, f"{100 * estimate.confidence:g} %"
+    if base is not None and base.interval is None and base.bound is None and not left_out:
+        left_out = say("error not known", model=model, reason=base.reason)
+    unseen = estimate.unseen
+    missed = say("may miss" if unseen < 1 else "may miss anything", unseen=format_alike(unseen)[0], sure=sure)
+    rows = {
+        name or f"P[f <= {estimate.gamma:g}]": _describe_p(estimate, noun),
+        "Given": estimate.given,
+        "Limited by": _describe_limit(estimate, model),
+        "Left out": left_out,
+        "May miss": missed,
+    }
+    return [row for row in rows.items() if row[1]]
+
+
+def list_warnings(warnings: Sequence[str]) -> list[Row]:
+    """Return the first warning, and how many more there are; nothing without one."""
+    if len(warnings) < 2:
+        return [("Warning", warning) for warning in warnings]
+    return [("Warning", say("warnings", first=warnings[0], more=len(warnings) - 1))]
+
+
+def _describe_p(estimate: Estimate, noun: str) -> str:
+    """Return p with its widest interval."""
+    sure, found = f"{100 * estimate.confidence:g} %", estimate.failures.total
+    low, high = find_ends(estimate, estimate.base_uncertainty)
+    if estimate.p == 0:
+        high = max(high, estimate.bound_missed(0.5 + estimate.confidence / 2))  # that of a search may be far lower
+        fact = "failures of the search alone" if found else "nothing failed"
+        return say(fact, n=f"{estimate.n_sim:,}", found=f"{found:,}", high=format_alike(high)[0], sure=sure)
+    odds = ""
+    if LEAST_ODDS < estimate.p < 0.1:
+        odds = f" (1 in {float(f'{1 / estimate.p:.2g}'):,.0f}{noun and f' {noun}'})"
+    p, below, above = format_alike(estimate.p, low, high)
+    return say("p" if low > 0 else "p without a lower limit", p=p, odds=odds, low=below, high=above, sure=sure)
+
+
+def _describe_limit(estimate: Estimate, model: str) -> str:
+    """Return whether the events behind the base distribution or the simulations make the interval as wide as it is."""
+    base, n, vague = estimate.base_uncertainty, f"{estimate.n_sim:,}", [p for p in estimate.parts if not p.resolved]
+    ends = sorted(((part.share * part.interval[1], part.name) for part in vague), reverse=True)
+    parts = [f"{part} (below {format_alike(high)[0]})" for high, part in ends[:NAMED_STRATA]]
+    parts += [f"{len(ends) - NAMED_STRATA} more strata"] if len(ends) > NAMED_STRATA else []
+    few = say("too few in strata", strata=" and ".join(parts)) if parts else ""
+    of_events = 1 - _share_of_simulations(estimate)
+    if base is None or of_events < NEGLIGIBLE:
+        return say("limited by simulations", n=n, few=few)
+    low, high = format_alike(*(estimate.sequence or estimate.interval))
+    exact = say("if the model is exact", low=low, high=high, model=model)
+    fact = "limited by events" if of_events > 1 - NEGLIGIBLE else "limited by both"
+    share, rest = (f"{100 * part:.0f} %" for part in (of_events, 1 - of_events))
+    return say(fact, events=base.fitted_to, n=n, few=few, share=share, rest=rest, exact=exact)
+
+
+def _share_of_simulations(estimate: Estimate) -> float:
+    """Return the share of the simulations in the squared upper half of the widest interval of log p."""
+    (_, own), (_, high) = estimate.sequence or estimate.interval, find_ends(estimate, estimate.base_uncertainty)
+    if not 0 < estimate.p < high:
+        return 1.0
+    return min(1.0, (math.log(max(own, estimate.p) / estimate.p) / math.log(high / estimate.p)) ** 2)
 
 
 register_stored(StoredEstimate, Estimate, Outcome, Part, BaseUncertainty, Failures, Level, Status, StoredMethod)

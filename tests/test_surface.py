@@ -278,7 +278,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config.write_text(f"env: {CUT_IN}\nmethod: mc\ngamma: 0.5\n")
     code, out, err = run(
         *f"estimate --ego idm --base us101 --measure ttc --seed 1 --max-sim 3000 --workers 1 --out {folder} --force "
-        f"--core torch --json --details --config {config} --max-p 0.9 --given-base".split()
+        f"--core torch --json --details --config {config} --max-p 0.9 --assume-traffic".split()
     )
     assert code == 0 and 0 < json.loads(out)["p"] < 0.9, err
     return folder
@@ -303,7 +303,7 @@ def test_a_run_has_a_report(study: Path) -> None:
 
 @pytest.mark.parametrize(("limit", "n", "expected"), [("0.5", 1000, 0), ("1e-4", 1000, 4), ("1e-2", 100, 5)])
 def test_a_gate_passes_fails_or_is_undecided(limit: str, n: int, expected: int) -> None:
-    gate = f"estimate {CUT_IN} --method mc --measure ttc --gamma 1.0 --given-base --max-sim {n} --max-p {limit}"
+    gate = f"estimate {CUT_IN} --method mc --measure ttc --gamma 1.0 --assume-traffic --max-sim {n} --max-p {limit}"
     assert run(*gate.split())[0] == expected
 
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 MAX_MESSAGE = 2_000
 """Characters of a message, which may repeat a name or a value of any length; of a longer one the middle is left out."""
+GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
+"""Exit codes of a comparison with a limit."""
 FIRST_BATCH = "Stopped: no estimate yet, the first batch of simulations was not complete."
 """What is known of a run whose single simulations are not counted, before its method has an estimate."""
 
@@ -213,7 +215,7 @@ class Question:
     )
     max_rate: float | None = arg(None, "Limit of the collisions per million km, in place of --max-p; exit codes alike.")
     gate_confidence: float = arg(0.95, "One-sided, of the comparison with the limit.", option="confidence")
-    given_base: bool = arg(False, "Compare with the limit as if the base distribution were the true one.")
+    assume_traffic: bool = arg(False, "Compare with the limit as if the traffic model were exact: of the ego alone.")
 
     def __post_init__(self) -> None:
         """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""

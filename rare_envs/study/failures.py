@@ -109,7 +109,7 @@ class Severity:
     def __str__(self) -> str:
         """Return a few lines for people."""
         curve, shown, (low, high) = self.curve, self._shown_thresholds, self.injuries.interval
-        lines = [f"collisions with delta-v {self._list_speeds(with_ends=True)}"]
+        lines = [f"collisions with delta-v {self._list_speeds()}"]
         if curve.base is not None and shown:
             base = curve.base
             held = f"{100 * base.confidence:g} % of all thresholds together"
@@ -126,22 +126,17 @@ class Severity:
             lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
         return "\n".join(lines)
 
-    def summarise(self) -> str:
-        """Return a short line for people, without intervals."""
-        injuries = f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario"
-        return f"delta-v {self._list_speeds(with_ends=False)}; {injuries}"
-
     @property
     def _shown_thresholds(self) -> list[int]:
         """Indices of the thresholds that are printed."""
         known = [i for i, v in enumerate(self.curve.thresholds) if v in SHOWN_DELTA_V and self.curve.low[i] > 0]
         return known[-SHOWN_THRESHOLDS:]
 
-    def _list_speeds(self, with_ends: bool) -> str:
-        """Return the curve at the thresholds that are printed, each with its interval or without, and the largest."""
+    def _list_speeds(self) -> str:
+        """Return the curve at the thresholds that are printed, each with its interval, and the largest."""
         curve, parts = self.curve, []
         for i in self._shown_thresholds:
-            ends = f" [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" if with_ends else ""
+            ends = f" [{curve.low[i]:.1e}, {curve.high[i]:.1e}]"
             parts.append(f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e}{ends}")
         return ", ".join([*parts, f"at most {self.largest_delta_v:.2g} m/s"])
 

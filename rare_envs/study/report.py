@@ -20,6 +20,7 @@ from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
+from rare_envs.study.arguments import Question
 from rare_envs.study.events import (
     COUNTED,
     EventRate,
@@ -34,6 +35,7 @@ from samplers.analysis.base_error import FIT_BIAS
 from samplers.analysis.gate import find_doubt, judge_ends, widen_ends
 from samplers.analysis.reweight import refit_quantile
 from samplers.evaluate import Fault
+from samplers.output import say
 from samplers.sample import Interval
 
 N_THRESHOLDS = 25
@@ -41,6 +43,10 @@ REACH = 0.5
 """P[f <= g] at the largest threshold."""
 COLLISION_MEASURE = "ttc"
 """The measure to advise: -1 after a collision and above 0 without one."""
+WHOLE = 1_000
+"""Lines of an answer that is not cut."""
+MODEL_NOUN = "traffic model"
+"""What a base distribution of scenarios is called."""
 ENSEMBLE_REASON = (
     "the parameters of an ensemble are those of all its refits; without --ensemble derivatives are by those of the base"
 )
@@ -63,43 +69,42 @@ def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | Non
         return None
 
 
+def explain_other_events(question: Question) -> str:
+    """Return which option makes a question count other events than collisions of the ego; empty where none does."""
+    measure = MEASURES.get(question.measure)
+    if not (isinstance(measure, Measure) and measure.collisions_only):
+        advised = f"counts other events than collisions (--measure {COLLISION_MEASURE} does)"
+        return f"--measure {question.measure} {advised}"
+    # where it is no number, f is graded by the crash
+    if not (measure.collision if isinstance(measure.collision, float) else 0.0) <= question.gamma <= 0:
+        return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
+    if question.collisions != "ego":
+        return f"--collisions {question.collisions} counts those between other vehicles too"
+    return ""
+
+
 def find_frequency(study: Study) -> EventFrequency:
     """Return the frequency of the events whose failures a question counts, or raise a ValueError that says why not."""
-    question, base, reason = study.question, study.fitted, ""
-    measure = MEASURES.get(question.measure)
-    advised = f"counts other events than collisions (--measure {COLLISION_MEASURE} does)"
-    if not (isinstance(measure, Measure) and measure.collisions_only):
-        reason = f"--measure {question.measure} {advised}"
-    # where it is no number, f is graded by the crash
-    elif not (measure.collision if isinstance(measure.collision, float) else 0.0) <= question.gamma <= 0:
-        reason = f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
-    elif question.collisions != "ego":
-        reason = f"--collisions {question.collisions} counts those between other vehicles too"
-    elif base is None or base.frequency is None:
-        reason = f"the base {study.base_name!r} of {find_scenario(question.env_id).name} has no event frequency, "
-        reason += explain_no_frequency({} if base is None else base.record)
-    else:
+    base, reason = study.fitted, explain_other_events(study.question)
+    if not reason and base is not None and base.frequency is not None:
         return base.frequency
+    if not reason:
+        name = find_scenario(study.question.env_id).name
+        reason = f"the base {study.base_name!r} of {name} has no event frequency, "
+        reason += explain_no_frequency({} if base is None else base.record)
     raise ValueError(f"no rate per km: {reason}")
 
 
-def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, ...]:
-    """Return which errors the interval of the rate leaves out, and why there is no lower end; empty if it holds all."""
-    base, found = estimate.base_uncertainty, []
+def describe_left_out(study: Study, estimate: samplers.Estimate) -> str:
+    """Return which error the intervals leave out, and why; empty if they hold all."""
+    base, reason = estimate.base_uncertainty, ""
     if study.question.ensemble:
-        mean = "ensemble: p is the mean over the refits, which stands for the error of the base distribution"
-        found.append(f"{mean}; no interval of that error is given, and that of the rate leaves it out")
-    if estimate.p == 0:
-        why = "no failure counts in p" if estimate.failures.total else "nothing failed"
-        found.append(f"{why}: the upper end is that of the simulations, without the error of the distribution")
-    elif base is None:
-        if not found:  # the mixture of the refits has none of its own
-            found.append("the error of the base distribution is not known (no refits), and left out of the rate")
-    elif base.bound is not None:
-        found.append(f"the events do not determine p (spread {base.spread:.1f}): the rate has an upper end only")
-    elif base.reason:
-        found.append(f"the error of the base distribution is left out of the rate: {base.reason}")
-    return tuple(found)
+        reason = "p is the mean over its refits, which stands for it"
+    elif estimate.p == 0:
+        reason = "which is not known without a failure that counts"
+    else:
+        reason = "it has no refits" if base is None else base.reason
+    return say("error not known", model=MODEL_NOUN, reason=reason) if reason else ""
 
 
 def has_exact_bound(estimate: samplers.Estimate) -> bool:
@@ -139,7 +144,7 @@ class Repeatability(NamedTuple):
 def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.Verdict:
     """Return whether a rate is below a limit; undecided for a reason, if there is one."""
     ends = rate.interval_per_million_km
-    return judge_ends(limit, ends, rate.confidence, reason, quantity="the rate of collisions per million km")
+    return judge_ends(limit, ends, rate.confidence, reason, quantity="collisions per million km")
 
 
 @dataclass(frozen=True)
@@ -251,7 +256,8 @@ class Report:
         found += [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
         found += [f"sensitivity is not known: {self.sensitivity}"] if isinstance(self.sensitivity, str) else []
         found += [self.lost] if self.lost else []
-        return (*found, *(() if self.no_rate else describe_left_out(self.study, self.estimate)))
+        left_out = "" if self.no_rate else describe_left_out(self.study, self.estimate)
+        return (*found, *([f"left out of the intervals: {left_out}"] if left_out else []))
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:
@@ -263,23 +269,27 @@ class Report:
         """Whether p, or the rate, is below the limit of the question; None without a limit."""
         question = self.study.question
         if question.max_rate is not None:
-            return judge_rate(question.max_rate, self.judged_rate, self.indecision)
+            if_exact = self._judge_rate(question.max_rate, True).decision
+            found = self._judge_rate(question.max_rate, question.assume_traffic)
+            return replace(found, if_exact=None if question.assume_traffic else if_exact)
         if question.max_p is None:
             return None
-        found = self.estimate.meets(question.max_p, question.given_base)
+        found = self.estimate.meets(question.max_p, question.assume_traffic)
         return replace(found, decision="undecided", reason=self.indecision) if self.indecision else found
+
+    def _judge_rate(self, limit: float, assume_traffic: bool) -> samplers.Verdict:
+        return judge_rate(limit, self.find_judged_rate(assume_traffic), self.indecision)
 
     @property
     def indecision(self) -> str:
         """Why nothing can be said of a limit, whatever it is; empty where something can."""
-        said = self.estimate.meets(0.5, self.study.question.given_base).reason
+        said = self.estimate.meets(0.5, self.study.question.assume_traffic).reason
         return said or find_doubt(self.doubts_of_f)
 
-    @property
-    def judged_rate(self) -> CollisionRate:
-        """The rate whose ends are compared with a limit: with the errors of the base, unless it is taken as given."""
-        estimate, given = self.estimate, self.study.question.given_base
-        rate = self._rate_of(estimate.p, estimate.cov, estimate.interval, None) if given else self.rate
+    def find_judged_rate(self, assume_traffic: bool) -> CollisionRate:
+        """Return the rate whose ends are compared with a limit: with the errors of the base, or taken as exact."""
+        estimate = self.estimate
+        rate = self._rate_of(estimate.p, estimate.cov, estimate.interval, None) if assume_traffic else self.rate
         assert rate is not None and rate.interval is not None  # `run` has looked for the frequency before
         return replace(rate, interval=widen_ends(estimate, rate.interval))
 
@@ -397,6 +407,8 @@ class Report:
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
         """Return the report as JSON-ready values: question, estimate and the `top` most likely failures."""
+        from rare_envs.study.text import describe_answer  # which imports this
+
         failures, space = self.estimate.failures, self.study.problem.space
         listed = itertools.islice(zip(failures, self.crashes, strict=True), top)
 
@@ -405,6 +417,7 @@ class Report:
 
         return {
             **self.estimate.to_dict(),
+            "text": describe_answer(self, most=WHOLE),
             "question": asdict(self.study.question),
             "average": self.average,
             "proviso": self.estimate.proviso,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,9 +30,11 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, build_problem, prepare
-from rare_envs.study.report import Report, find_frequency, judge_rate
+from rare_envs.study.report import WHOLE, Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
+from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
+from samplers.result import list_warnings
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
@@ -183,10 +186,16 @@ class Risk:
         limit = self.scenarios[0].report.study.question.max_rate
         if limit is None:
             return None
-        rates = (replace(each.report.judged_rate, site_log_sd=each.rate.site_log_sd) for each in self.scenarios)
         missing = [f"{text.name_scenario(name)} is left out" for name in self.left_out]
-        reasons = filter(None, [*missing, *(each.report.indecision for each in self.scenarios)])
-        return judge_rate(limit, exposure.TotalRate(tuple(rates)), next(reasons, ""))
+        reason = next(filter(None, [*missing, *(each.report.indecision for each in self.scenarios)]), "")
+
+        def judge(assume_traffic: bool) -> samplers.Verdict:
+            found = [(each.report.find_judged_rate(assume_traffic), each.rate.site_log_sd) for each in self.scenarios]
+            rates = tuple(replace(rate, site_log_sd=spread) for rate, spread in found)
+            return judge_rate(limit, exposure.TotalRate(rates), reason)
+
+        assumed = self.scenarios[0].report.study.question.assume_traffic
+        return replace(judge(assumed), if_exact=None if assumed else judge(True).decision)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -203,25 +212,33 @@ class Risk:
         )
 
     def __str__(self) -> str:
-        """Return the table, for people: the total first, a line for each event, warnings last."""
+        """Return the answer, for people: the rate, a table by event, what limits it, and last the verdict."""
+        return "\n".join(self.describe())
+
+    def describe(self, last: Sequence[Row] = (), most: int = MOST_LINES) -> list[str]:
+        """Return the lines of the answer, at most so many beside the table; `last` are facts before the verdict."""
         total, kinds, counted = self.total, self.kinds, self.people
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
         per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, "", level)
         beside = "" if counted is None else f"; people in the same events {text.describe_people(counted)}"
-        missed = text.list_uncalibrated(self.events)
-        beside += f"; uncalibrated in {missed}" if missed else ""
-        lines = [
-            f"{self.ego}: collisions per million km {per_km}{beside}",
-            *([] if self.verdict is None else [f"  limit        {self.verdict}"]),
-            *(f"  {line}" for line in text.tabulate_events(self.events)),
-        ]
-        if whole > 0:
-            parts = (f"{kind} {text.format_rate(r)} ({text.format_share(r / whole)})" for kind, r in kinds.items())
-            lines.append(f"  by kind      {', '.join(parts)}")
-        lines += [] if self.injuries is None else [f"  injuries     {text.describe_injuries(self.injuries)}"]
-        lines += [f"  uncertainty  {said}" for said in filter(None, [text.describe_uncertainty(total)])]
-        lines.append(f"  traffic      {'; '.join(each.describe_traffic() for each in self.scenarios)}")
-        lines += [f"  human model  {text.describe_columns()}"]
+        far = [each for each in self.events if each.uncalibrated]
+        missed = "; ".join(f"{text.name_event(each)} {text.describe_calibration(each)}" for each in far)
+        parts = (f"{text.format_share(r / whole)} {text.describe_kind(kind)}" for kind, r in kinds.items() if whole)
+        rows = {
+            "Limited by": text.describe_uncertainty(total),
+            "Calibration": missed or text.describe_columns(),
+            "Crashes": ", ".join(parts),
+            "Injuries": "" if self.injuries is None else text.describe_injuries(self.injuries),
+        }
+        facts = [*(row for row in rows.items() if row[1]), *list_warnings(self.warnings), *last]
+        gate, table = text.list_gate(self.verdict), text.tabulate_events(self.events, total)
+        title = f"{self.ego}: collisions per million km {per_km}{beside}"
+        return [*textwrap.wrap(title, WIDTH), *table, *fold_rows(facts, most - 1 - len(table) - len(gate)), *gate]
+
+    def details(self) -> str:
+        """Return the traffic behind each scenario, what the columns are, and all notes and warnings."""
+        lines = [f"traffic      {'; '.join(each.describe_traffic() for each in self.scenarios)}"]
+        lines += [f"human model  {text.describe_columns()}"]
         return "\n".join(
             [*lines, *(f"note: {each}" for each in self.notes), *(f"warning: {each}" for each in self.warnings)]
         )
@@ -241,6 +258,7 @@ class Risk:
             "doubtful": bool(self.warnings),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
+            "text": self.describe(most=WHOLE),
             "version": __version__,
         }
 

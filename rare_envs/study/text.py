@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import shlex
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +19,15 @@ from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
 from rare_envs.plugins import clean_text
+from rare_envs.study.arguments import GATE_CODES, Question
 from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
-from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate
+from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.replay import name_parties
-from rare_envs.study.report import Report
-from samplers.output import indent_lines
+from rare_envs.study.report import MODEL_NOUN, Report, describe_left_out, explain_other_events
+from samplers.output import MOST_LINES, WIDTH, Row, fold_rows, format_alike, indent_lines, say
 from samplers.problem import FloatArray
-from samplers.sample import describe_outcome
+from samplers.result import list_facts, list_warnings
 
 EVENT_NOUNS = {
     "cut_in": "cut-ins",
@@ -34,26 +38,6 @@ EVENT_NOUNS = {
 }
 """Events, and those of scenarios, in the plural."""
 SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulation"}
-LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
-"""Rates from which whole numbers are shown, and below which powers of ten: alone, and beside a rate above `SMALL`."""
-
-
-def format_alike(*values: float) -> list[str]:
-    """Return rates with two digits, all as decimals or all with powers of ten."""
-    sizes = [value for value in values if value > 0 and math.isfinite(value)]
-    least = SMALL if max(sizes, default=SMALL) < SMALL else SMALL_BESIDE
-    decimal = all(value >= least for value in sizes)
-
-    def write(value: float) -> str:
-        if value <= 0 or not math.isfinite(value):
-            return f"{value:g}"
-        if not decimal:
-            return f"{value:.1e}"
-        if value >= LARGE:
-            return f"{round(value, 1 - math.floor(math.log10(value))):,.0f}"
-        return f"{value:#.2g}".rstrip(".")
-
-    return [write(value) for value in values]
 
 
 def format_rate(value: float) -> str:
@@ -79,11 +63,15 @@ def name_scenario(name: str) -> str:
     return "cut-in" if name == "cut_in" else name.replace("_", " ")
 
 
+def name_event(each: EventRate) -> str:
+    """Return a kind of event in the plural."""
+    return EVENT_NOUNS.get(each.event, each.event)
+
+
 def describe_injuries(rate: exposure.CollisionRate | exposure.TotalRate) -> str:
-    """Return a rate of serious injuries with its interval, in words."""
-    return "serious injuries (MAIS 3+) " + format_with_interval(
-        rate.per_million_km, rate.interval_per_million_km, " per million km", f"{100 * rate.confidence:g} %: "
-    )
+    """Return a rate of serious injuries with its interval."""
+    found = format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
+    return say("serious injuries", rate=found)
 
 
 def describe_people(counted: people.HumanBenchmark | None) -> str:
@@ -93,20 +81,32 @@ def describe_people(counted: people.HumanBenchmark | None) -> str:
     return format_with_interval(counted.per_million_km, counted.interval_per_million_km)
 
 
+def describe_rate(each: EventRate) -> str:
+    """Return the rate of an event per million km with its interval, or its upper end where it is not resolved."""
+    ends = each.rate.interval_per_million_km
+    if each.event in each.unresolved:
+        return f"below {format_rate(ends[1])}"
+    return format_with_interval(each.rate.per_million_km, ends)
+
+
 def describe_model(each: EventRate) -> str:
-    """Return the model's contacts per million km, with and without headway rule, and how far it is from people."""
-    known, scores = each.calibration, ""
-    if known is not None:
-        counts = [known.per_million_km(name) for name in (MODEL, NO_HEADWAY_RULE)]
-        scores = " and ".join(dict.fromkeys(format_alike(*(count.p for count in counts))))
-        if not any(count.p for count in counts):
-            scores = f"below {format_rate(max(count.high for count in counts))}"
-    return ": ".join(filter(None, (scores, each.uncalibrated)))
+    """Return the contacts per million km of the human driver model, with and without headway rule; "-" if unknown."""
+    if each.calibration is None:
+        return "-"
+    counts = [each.calibration.per_million_km(name) for name in (MODEL, NO_HEADWAY_RULE)]
+    if not any(count.p for count in counts):
+        return f"below {format_rate(max(count.high for count in counts))}"
+    return " and ".join(dict.fromkeys(format_alike(*(count.p for count in counts))))
 
 
-def list_uncalibrated(events: Sequence[EventRate]) -> str:
-    """Return the kinds of event without a calibrated rate; empty where there is none."""
-    return ", ".join(EVENT_NOUNS.get(each.event, each.event) for each in events if each.uncalibrated)
+def describe_calibration(each: EventRate) -> str:
+    """Return whether the human driver model comes near people in an event."""
+    known, model = each.calibration, describe_model(each)
+    if known is None:
+        return say("not measured", traffic=Path(each.traffic).name)
+    if not known.is_calibrated:
+        return say("not calibrated", model=model, far=known.describe_factor())
+    return say("calibrated", model=model, factor=f"{people.CALIBRATED_WITHIN:g}")
 
 
 def describe_parts(shares: Mapping[str, float], unresolved: Mapping[str, float]) -> str:
@@ -126,23 +126,28 @@ def tabulate(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(f"{word:<{width}}" for word, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def tabulate_events(events: Sequence[EventRate]) -> list[str]:
-    """Return a table of the rates of events per million km, each beside people and the human driver model in it."""
+def tabulate_events(events: Sequence[EventRate], total: exposure.TotalRate | None = None) -> list[str]:
+    """Return a table of the rates of events per million km, each beside people and the human driver model in it.
+
+    With `total` its last row has the sum, beside people in all of these events.
+    """
     rows = [("", "per km", "per event", "per million km", "people in them", "human model")]
     for each in events:
         rate, resolved = each.rate, each.event not in each.unresolved
         found = rate.p if rate.interval is None or (rate.p > 0 and resolved) else rate.interval[1]
         p = f"{'' if rate.p > 0 and resolved else 'below '}{min(found / each.share, 1.0):.1e}"
         numbers = format_rate(rate.frequency.per_km * each.share), p
-        ends = rate.interval_per_million_km
-        ego = format_with_interval(rate.per_million_km, ends) if resolved else f"below {format_rate(ends[1])}"
-        name = EVENT_NOUNS.get(each.event, each.event)
-        rows.append((name, *numbers, ego, describe_people(each.people), describe_model(each)))
+        name = name_event(each)
+        rows.append((name, *numbers, describe_rate(each), describe_people(each.people), describe_model(each)))
+    if total is not None:
+        whole = format_with_interval(total.per_million_km, total.interval_per_million_km)
+        rows.append(("all", "", "", whole, describe_people(sum_people(events)), ""))
     head, *lines = tabulate(rows)
     vague = ({name: end for name, end in each.unresolved.items() if name != each.event} for each in events)
     below = (describe_parts(each.parts, ends) for each, ends in zip(events, vague, strict=True))
     parts = ([f"  {more}"] if more else [] for more in below)
-    return [head, *(line for row, more in zip(lines, parts, strict=True) for line in (row, *more))]
+    table = (line for row, more in zip(lines, parts, strict=False) for line in (row, *more))
+    return [head, *table, *lines[len(events) :]]
 
 
 def describe_columns() -> str:
@@ -175,8 +180,7 @@ def name_source(each: exposure.VarianceShare) -> str:
 
 
 Result = Mapping[str, Any]
-WIDE_BASE = 10.0
-"""Ratio of the ends of the interval of the base distribution from which on the report warns of it."""
+"""What result.json holds."""
 
 
 def format_probability(p: float | None, like: float | None = None) -> str:
@@ -198,24 +202,6 @@ def explain_no_gain(p: float, resolved: bool) -> str:
     if not resolved:
         return "not known, as a stratum is not resolved"
     return "none, as every scenario fails" if p >= 1 else "not known, as the c.o.v. is 1 or more"
-
-
-def describe_wide_base(result: Result) -> str:
-    """Return how far the events behind the base distribution leave p open; empty below `WIDE_BASE`."""
-    base = result.get("base_uncertainty")
-    if not isinstance(base, dict) or not result["p"]:
-        return ""
-    behind, ends = f" ({base.get('fitted_to', '')})", base.get("interval")
-    if ends is None:
-        return f"the recorded events do not bound p{behind}: {base.get('reason') or 'its spread is too large'}"
-    low, high = (float(end) for end in ends)
-    if high < WIDE_BASE * low or high <= 0.0:
-        return ""
-    factor = f"by a factor of {float(f'{high / low:.2g}'):,.0f}, " if low > 0.0 else ""
-    return (
-        f"the recorded events leave p open {factor}from {format_probability(low, low)} to "
-        f"{format_probability(high, low)}{behind}"
-    )
 
 
 def describe_kind(kind: str) -> str:
@@ -243,53 +229,137 @@ N_UNUSUAL = 3
 """Parameters of the most likely failure that are named at most."""
 NAMED_SHARE = 1e-4
 """Share of p from which on a kind of crash is named."""
+CRASHES = "Crashes"
+"""The name of p where it counts collisions of the ego."""
 
 
 ENOUGH, MANY = 30, 1_000_000
 """Failures that a run by plain Monte Carlo is to find, and simulations that are advised for it at most."""
-Row = tuple[str, str]
-"""A line of the answer: its name, and its text."""
+
+
+def describe_answer(report: Report, last: Sequence[Row] = (), most: int = MOST_LINES) -> list[str]:
+    """Return the answer in at most so many lines: the number with its widest interval first; `last` are further facts.
+
+    Method, c.o.v. and all intervals are in `list_details`.
+    """
+    study, estimate = report.study, report.estimate
+    average = f", {report.average}" if report.average else f", traffic {Path(study.base_name).name}"
+    title = f"{study.question.ego} in {study.question.env_id}{average}"
+    noun = EVENT_NOUNS.get(study.problem.world.scenario.name, "scenarios")
+    left_out = describe_left_out(study, estimate)
+    name = name_p(study.question)
+    what = "Crash" if name == CRASHES else "Failure"
+    *facts, missed = list_facts(estimate, name, noun, MODEL_NOUN, left_out)
+    rows = [*facts, *_list_rates(report), (what, _describe_crashes(report)), missed]
+    head = textwrap.wrap(title, WIDTH, subsequent_indent="  ")
+    return [*head, *fold_rows([*rows, *list_warnings(report.warnings), *last], most - len(head))]
+
+
+def name_p(question: Question) -> str:
+    """Return what a question counts."""
+    if not explain_other_events(question):
+        return CRASHES
+    return f"P[{'f' if ':' in question.measure else question.measure} <= {question.gamma:g}]"
 
 
 def print_report(report: Report, out: Path | None = None, details: bool = False) -> None:
-    """Print the number, what it rests on, the most likely failure, and where the files are; with details everything."""
+    """Print the answer, with details everything behind it, and last the verdict, if there is a limit."""
     console = CleanConsole(highlight=False, soft_wrap=True, markup=False)
-    estimate, question = report.estimate, report.study.question
-    odds = f" (1 in {1 / estimate.p:,.0f} scenarios)" if 0 < estimate.p < 0.1 else ""
-    average = f", {report.average}" if report.average else ""
-    head = f"{estimate.headline}{odds}   {question.env_id}, ego {question.ego}{average}"
-    console.print(head, style="bold")
-    ends = "{:.3e} to {:.3e}".format(*estimate.interval)
-    if report.verdict is not None:
-        ends += f" (each end is one-sided at {50 + 50 * estimate.confidence:g} %, for the limit)"
-    console.print(_write_row(f"{100 * estimate.confidence:g} % interval", ends))
-    if estimate.sequence is not None:
-        looks = "{:.3e} to {:.3e}, as the run stopped on what it saw".format(*estimate.sequence)
-        console.print(_write_row("at every look", looks))
-    if report.verdict is not None:
-        console.print(_write_row("limit", str(report.verdict)), style="bold")
-    fixed = f"no interval: {report.study.base_name!r} has no refits to events, so p takes it as the truth"
-    lines = list(indent_lines(estimate.base_uncertainty or f"base distribution  {fixed}"))
-    parts = [("strata" if number == 0 else "", str(part)) for number, part in enumerate(estimate.parts)]
-    for rows in (parts, _list_other_bases(report), _list_rates(report, details), _list_effort(report, details)):
-        lines += [_write_row(*row) for row in rows]
-    lines += [_write_row(*row) for row in (*_list_kinds(report, details), *_list_faults(report))]
-    lines += [f"  {line}" for line in _describe_failure(report, details)]
-    lines += indent_lines(report.sensitivity) if isinstance(report.sensitivity, samplers.Sensitivity) else ()
+    where = "--details" if out is None else f"rare-envs report {shlex.quote(str(out))}".replace(" ", "\xa0")
+    what = say("details" if out is None else "report")
+    gate = list_gate(report.verdict)
+    title, *lines = describe_answer(report, [("Next", say("next", command=where, what=what))], MOST_LINES - len(gate))
+    console.print(title, style="bold")
     for line in lines:
+        console.print(line, style="yellow" if line.startswith("Warning") else None)
+    asked = [_write_row(*row) for row in _list_other_bases(report)]
+    asked += indent_lines(report.sensitivity) if isinstance(report.sensitivity, samplers.Sensitivity) else []
+    for line in (*asked, *(list_details(report, out) if details else ())):
         console.print(line)
-    for warning in (*report.doubts_of_method, *report.doubts_of_f):
-        console.print(f"warning: {warning}", style="yellow")
-    lines = [f"remark: {remark}" for remark in report.remarks] + [f"note: {note}" for note in report.notes]
+    for line in gate:
+        console.print(line, style="bold")
+
+
+def list_gate(verdict: samplers.Verdict | None) -> list[str]:
+    """Return the lines of a verdict, the last of them with the decision, its exit code and its cause."""
+    if verdict is None:
+        return []
+    ends, why = verdict.describe_ends(), verdict.cause
+    if why and verdict.if_exact in ("passes", "fails"):
+        why += f"; --assume-traffic {verdict.if_exact}"
+    line = say("gate", decision=verdict.decision, code=GATE_CODES[verdict.decision], why=why or ends)
+    return [*(fold_rows([("Limit", ends)]) if why else []), textwrap.shorten(line, WIDTH, placeholder=" ...")]
+
+
+def list_details(report: Report, out: Path | None = None) -> Iterator[str]:
+    """Yield all intervals, the method and its effort, all parameters of the most likely failure, and all remarks."""
+    estimate, question = report.estimate, report.study.question
+    warned = replace(estimate, warnings=report.doubts_of_method, remarks=report.remarks)
+    yield from ("", *warned.details().splitlines())
+    earlier = f" ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else ""
+    made_by = f"{question.core}{'' if question.device == 'cpu' else f' on {question.device}'}"
+    yield f"  {report.seconds:.1f} s{earlier} by {made_by}"
+    yield from (_write_row(*row) for row in (*_list_all_rates(report), *_list_kinds(report), *_list_faults(report)))
+    yield from (f"  {line}" for line in _describe_failure(report))
+    yield from (f"warning: {warning}" for warning in report.doubts_of_f)
+    yield from (f"note: {note}" for note in report.notes)
     if question.method != "mc" and ENOUGH / MANY <= estimate.p < estimate.unseen:
         place = 10 ** math.floor(math.log10(ENOUGH / estimate.p))
         n = place * math.ceil(ENOUGH / estimate.p / place)
-        lines.append(f"check: --method mc --max-sim {n} does not rely on a search")
+        yield f"check: --method mc --max-sim {n} does not rely on a search"
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
-        lines.append(f"written to {out}: {names}")
-    for line in lines:
-        console.print(line)
+        yield f"written to {out}: {names}"
+
+
+def _list_rates(report: Report) -> Iterator[Row]:
+    """Yield collisions per million km beside people and the human driver model in the same events, or why not."""
+    rate, events = report.rate, report.events
+    if rate is None:
+        yield "Rate", report.no_rate
+        return
+    found = format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
+    injuries, counted = report.injury_rate, describe_people(sum_people(events))
+    nouns = [name_event(each) for each in events]
+    if len(events) == 1:
+        yield "Rate", say("rate", rate=found, noun=nouns[0], people=counted)
+        yield "Calibration", describe_calibration(events[0])
+        if injuries is not None:
+            yield "Injuries", describe_injuries(injuries)
+        return
+    yield "Rate", say("rate of all", rate=found, people=counted)
+    for noun, each in zip(nouns, events, strict=True):
+        model = f"{describe_model(each)}{', not calibrated' if each.uncalibrated else ''}"
+        counted = describe_people(each.people)
+        yield "of which", say("rate of one", noun=noun, rate=describe_rate(each), people=counted, model=model)
+
+
+def _describe_crashes(report: Report) -> str:
+    """Return the kinds of crash by their share in p, and the most likely crash in a sentence."""
+    failures, space, shares = report.estimate.failures, report.study.problem.space, report.kinds.shares
+    if not len(failures):
+        return "no failure found"
+    named = {kind: each.of_failures for kind, each in shares.items() if each.of_failures >= NAMED_SHARE}
+    kinds = ", ".join(f"{format_share(share)} {describe_kind(kind)}" for kind, share in named.items())
+    k = _find_likeliest(failures)
+    what, unusual = _describe_end(report, k), _list_unusual(space, failures.x[k])
+    text = f"{what}, {unusual or say('usual')}"
+    return say("likeliest", kinds=kinds, what=text) if kinds else text
+
+
+def _find_likeliest(failures: samplers.Failures) -> int:
+    """Return the number of the most likely failure, of those with an outcome if there are any."""
+    return int(np.argmax(~np.isnan(failures.f)))
+
+
+def _describe_end(report: Report, k: int) -> str:
+    """Return how a failure ends: its crash, or its f."""
+    crash, f = report.crashes[k], report.estimate.failures.f[k]
+    if crash is None:
+        return "the ego failed" if math.isnan(f) else f"f = {f:.3g}"
+    who, whom = name_parties(crash, report.study.problem.world.scenario.labels)
+    speed, delta_v = (f"{value:.1f}" for value in (crash["impact_speed"], max(crash["delta_v"])))
+    return say("crash", who=who, whom=whom, speed=speed, delta_v=delta_v)
 
 
 def _write_row(name: str, text: str) -> str:
@@ -308,62 +378,27 @@ def _list_other_bases(report: Report) -> Iterator[Row]:
             yield f"under {base}", f"{ends}, {found.ess:.0f} effective failing points"
 
 
-def _list_rates(report: Report, details: bool) -> Iterator[Row]:
-    """Yield collisions and injuries per million km beside those of people, or why they are not known."""
-    rate, injuries, unit = report.rate, report.injury_rate, " per million km"
+def _list_all_rates(report: Report) -> Iterator[Row]:
+    """Yield what the rate is made of, by event and source of uncertainty, and injuries."""
+    rate, injuries = report.rate, report.injury_rate
     if rate is None:
-        yield "collisions", report.no_rate
         return
-    per_km = format_with_interval(rate.per_million_km, rate.interval_per_million_km, unit)
-    yield "collisions", per_km
+    yield "collisions", format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
     yield from (("", line) for line in tabulate_events(report.events))
-    if details:
-        events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
-        yield "", "; ".join(filter(None, [f"from {events}", describe_uncertainty(exposure.TotalRate((rate,)))]))
-    if injuries is not None and details:
-        yield "", describe_injuries(injuries)
-    elif injuries is not None:
-        ends = format_with_interval(injuries.per_million_km, injuries.interval_per_million_km, unit)
-        yield "injuries", f"{ends}, serious ones (MAIS 3+)"
+    events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
+    yield "", "; ".join(filter(None, [f"from {events}", describe_uncertainty(exposure.TotalRate((rate,)))]))
+    if injuries is not None:
+        yield "injuries", describe_injuries(injuries)
 
 
-def _list_effort(report: Report, details: bool) -> Iterator[Row]:
-    """Yield the coefficient of variation, the method, and what the run took."""
-    estimate, question = report.estimate, report.study.question
-    cov = "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"
-    gain = explain_no_gain(estimate.p, all(part.resolved for part in estimate.parts))
-    if not math.isnan(estimate.gain):
-        size = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
-        needed = estimate.gain * estimate.n_sim
-        gain = f"{size} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
-    run = f"{estimate.method.name}, seed {estimate.seed}, {describe_outcome(estimate.status, report.warnings)}"
-    earlier = f" ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else ""
-    made_by = f"{question.core}{'' if question.device == 'cpu' else f' on {question.device}'}"
-    time = f"{estimate.n_sim:,}{'' if details else ' simulations'} in {report.seconds:.1f} s{earlier} by {made_by}"
-    rows = {"c.o.v.": f"{cov}; gain {gain}", "method": f"{run}; {time}"}
-    if details:
-        rows = {"c.o.v.": cov, "simulations": time, "unseen": estimate.proviso, "gain": gain, "method": run}
-    chosen = {"chosen": estimate.choice} if estimate.chosen is not None and estimate.chosen.unusual else {}
-    yield from ({**rows, **chosen} if details else {**rows, **chosen, "unseen": estimate.proviso}).items()
-
-
-def _list_kinds(report: Report, details: bool) -> Iterator[Row]:
+def _list_kinds(report: Report) -> Iterator[Row]:
     """Yield p by kind of crash, and how severe the collisions are."""
-    shares, severity, rows = report.kinds.shares, report.kinds.severity, dict[str, list[str]]()
-    if details:
-        for kind, share in shares.items():
-            low, high = share.interval
-            numbers = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %"
-            rows.setdefault("of which", []).append(f"{numbers}: {KIND_DESCRIPTIONS.get(kind, kind)}")
-        rows["severity"] = str(severity or "").splitlines()
-    else:
-        named = {kind: each.of_failures for kind, each in shares.items() if each.of_failures >= NAMED_SHARE}
-        parts = [f"{100 * share:.3g} % {KIND_DESCRIPTIONS.get(kind, kind)}" for kind, share in named.items()]
-        rare = len(shares) - len(named)
-        parts += [f"{rare} rarer than {100 * NAMED_SHARE:g} %"] if rare else []
-        rows["of which"] = ["; ".join(parts)] if parts else []
-        rows["severity"] = [] if severity is None else [severity.summarise()]
-    for name, lines in rows.items():
+    rows = []
+    for kind, share in report.kinds.shares.items():
+        low, high = share.interval
+        numbers = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %"
+        rows.append(f"{numbers}: {describe_kind(kind)}")
+    for name, lines in {"of which": rows, "severity": str(report.kinds.severity or "").splitlines()}.items():
         yield from ((name if number == 0 else "", line) for number, line in enumerate(lines))
 
 
@@ -377,31 +412,18 @@ def _list_faults(report: Report) -> Iterator[Row]:
         yield "", f"{report.n_retried:,} more simulations were made to find them"
 
 
-def _describe_failure(report: Report, details: bool) -> Iterator[str]:
-    """Yield the most likely failure: how it ends, and what is unusual about it, or all of its parameters."""
-    failures, space = report.estimate.failures, report.study.problem.space
+def _describe_failure(report: Report) -> Iterator[str]:
+    """Yield the most likely failure: how it ends, and all of its parameters."""
+    failures = report.estimate.failures
     if not len(failures):
-        yield "no failure found"
         return
-    with_outcome = np.flatnonzero(~np.isnan(failures.f))
-    k = int(with_outcome[0]) if len(with_outcome) else 0
-    crash, f = report.crashes[k], f"f = {failures.f[k]:.3g}" if len(with_outcome) else "the ego failed"
-    what = ""
+    k = _find_likeliest(failures)
+    f = "the ego failed" if math.isnan(failures.f[k]) else f"f = {failures.f[k]:.3g}"
+    yield f"most likely of {failures.total:,} failures found ({f}; in brackets the central 90 % of ordinary scenarios):"
+    crash = report.crashes[k]
     if crash is not None:
-        who, whom = name_parties(crash, report.study.problem.world.scenario.labels)
-        speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
-        what = f"{who} runs into {whom}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
-    found, brackets = f"most likely of {failures.total:,} failures found", "in brackets the central 90 %"
-    if details:
-        yield f"{found} ({f}; {brackets} of ordinary scenarios):"
-        yield from [f"  {what}"] if what else []
-        yield from _list_parameters(space, failures.x[k])
-        return
-    yield f"{found}: {what or f}"
-    unusual = _list_unusual(space, failures.x[k])
-    but = " but drivers' weights or noise" if max(space.sizes) > MAX_SHOWN else ""
-    nothing = f"nothing beyond the central 90 % of ordinary scenarios{but}"
-    yield f"  unusual in it: {f'{unusual} ({brackets} of ordinary scenarios)' if unusual else nothing}"
+        yield f"  {_describe_end(report, k)}, serious injury {100 * max(crash['injury_risk']):.2g} %"
+    yield from _list_parameters(report.study.problem.space, failures.x[k])
 
 
 def _list_unusual(space: ScenarioSpace, x: FloatArray) -> str:
@@ -410,12 +432,16 @@ def _list_unusual(space: ScenarioSpace, x: FloatArray) -> str:
     low, high = find_ordinary_range(draw_ordinary(space))
     beyond = np.maximum(low - x, x - high) / np.maximum(high - low, 1e-12)
     shown = [j for j in np.argsort(-beyond) if beyond[j] > 0 and columns[j].shown]
-    named = [
-        f"{columns[j].name} {format_value(x[j])} {columns[j].unit} "
-        f"[{format_value(low[j], 1)} to {format_value(high[j], 1)}]"
+    return ", ".join(
+        say("unusual", name=columns[j].name, unit=columns[j].unit, **_describe_value(x[j], low[j], high[j]))
         for j in shown[:N_UNUSUAL]
-    ]
-    return ", ".join([*named, *([f"{len(shown) - N_UNUSUAL} more"] if len(shown) > N_UNUSUAL else [])])
+    )
+
+
+def _describe_value(value: float, low: float, high: float) -> dict[str, str]:
+    """Return a parameter and the ends of what is ordinary, with two digits."""
+    known = {"value": value, "low": low, "high": high}
+    return {name: f"{'-' if each < 0 else ''}{format_rate(abs(each))}" for name, each in known.items()}
 
 
 def _list_parameters(space: ScenarioSpace, x: FloatArray) -> Iterator[str]:

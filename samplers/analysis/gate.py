@@ -36,6 +36,7 @@ from typing import Any, Literal
 from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.weighted import Reported
 from samplers.method import EstimateData
+from samplers.output import format_alike, say
 from samplers.problem import check_number
 from samplers.sample import COARSE, Interval, Status
 
@@ -54,7 +55,7 @@ class Verdict(Reported):
         >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
         >>> result = samplers.estimate(problem, seed=0, max_sim=6000, confidence=0.9)  # p = 2.3e-4
         >>> print(result.meets(1e-3))
-        passes: p is below 0.001 with 95 % confidence (one-sided upper end 2.40e-04)
+        passes: p below 0.001 (95 % confidence, upper limit 2.4e-04)
         >>> bool(result.meets(1e-4)), result.meets(1e-4).decision
         (False, 'fails')
     """
@@ -73,6 +74,8 @@ class Verdict(Reported):
     """Why it is undecided, beside the ends."""
     quantity: str = "p"
     """What is below the limit or not."""
+    if_exact: Decision | None = None
+    """The decision if the base distribution were the true one; None where the ends do not hold its uncertainty."""
 
     def __bool__(self) -> bool:
         """Return whether it passes."""
@@ -80,16 +83,23 @@ class Verdict(Reported):
 
     def __str__(self) -> str:
         """Return one sentence."""
-        what, sure = f"{self.quantity} is", f"{100 * self.confidence:.4g} % confidence"
-        base = ", the base distribution's uncertainty included" if self.includes_base else ""
-        low, high = (format(end, ".2e" if self.high < 0.01 else ".3g") for end in (self.low, self.high))
+        why = f"; {self.cause}" if self.cause else ""
+        if self.cause and self.if_exact in ("passes", "fails"):
+            why += f"; {say('if exact', decision=self.if_exact)}"
+        return f"{self.decision}: {self.describe_ends()}{why}"
+
+    def describe_ends(self) -> str:
+        """Return where the ends lie, in words."""
+        low, high = format_alike(self.low, self.high)
+        sure = f"{100 * self.confidence:.4g} %"
+        return say(self.decision, what=self.quantity, limit=f"{self.limit:g}", sure=sure, low=low, high=high)
+
+    @property
+    def cause(self) -> str:
+        """Why it is undecided, and what would decide it; empty where it is decided."""
         if self.decision != "undecided":
-            side, end = ("below", f"upper end {high}") if self else ("above", f"lower end {low}")
-            return f"{self.decision}: {what} {side} {self.limit:g} with {sure} (one-sided {end}{base})"
-        if self.reason:
-            return f"undecided: whether {what} below {self.limit:g} cannot be said, as {self.reason}"
-        ends = f"{low} and {high}, at {sure}{base}"
-        return f"undecided: {self.limit:g} is between the one-sided ends of {self.quantity}, {ends}"
+            return ""
+        return self.reason or say("too few events" if self.if_exact in ("passes", "fails") else "too few simulations")
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -102,6 +112,13 @@ def widen_ends(estimate: EstimateData, ends: Interval) -> Interval:
         return ends
     (low, high), (seq_low, seq_high) = estimate.interval, estimate.sequence
     return ends[0] * (seq_low / low if low > 0 else 1.0), min(1.0, ends[1] * seq_high / high)
+
+
+def find_ends(estimate: EstimateData, base: BaseUncertainty | None) -> Interval:
+    """Return the widest ends of p: with the error of a fitted base where it is known, at all looks at the run."""
+    if base is None or (base.interval is None and base.bound is None):
+        return estimate.sequence or estimate.interval
+    return widen_ends(estimate, base.interval or (0.0, 1.0 if base.bound is None else base.bound))
 
 
 def find_doubt(warnings: Sequence[str]) -> str:
@@ -131,9 +148,12 @@ def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty |
         ends = base.interval or (0.0, 1.0 if base.bound is None else base.bound)
         if base.interval is None and base.bound is None:
             reason = f"p under the refits of the base distribution is not known: {base.reason.rstrip('.')}"
+            reason = reason if base.value else "without a failure the error of the base distribution is not known"
     doubts = (*(() if none_failed else estimate.warnings), *(() if base is None else base.warnings))
     ends, reason = widen_ends(estimate, ends), find_doubt(doubts) or reason
-    return judge_ends(max_p, ends, estimate.confidence, reason, includes_base=base is not None)
+    if_exact = None if base is None else judge_estimate(estimate, max_p, None).decision
+    about = {"includes_base": base is not None, "if_exact": if_exact}
+    return judge_ends(max_p, ends, estimate.confidence, reason, **about)
 
 
 MAX_PILOT_COV = 0.5

@@ -17,7 +17,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.output import StoredMethod, read_object, register_stored, write_object
+from samplers.output import StoredMethod, format_alike, read_object, register_stored, write_object
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 
@@ -38,11 +38,12 @@ def test_to_dict_is_plain_json():
 def test_a_run_that_stops_on_what_it_sees_has_ends_that_hold_at_every_look(method: str, target: float | None) -> None:
     estimate = samplers.estimate(half_space(2, 2.0).problem, method, seed=0, max_sim=20_000, target_cov=target)
     if (method, target) == ("mc", None):
-        assert estimate.sequence is None and "every look" not in str(estimate)
+        assert estimate.sequence is None and "every look" not in estimate.details()
         return
     (low, high), (below, above) = estimate.interval, estimate.sequence
     assert estimate.n_sim < 20_000 and below < low < high < above
-    assert f"at every look [{below:.3e}, {above:.3e}], as the run stopped on what it saw" in str(estimate)
+    assert f"at every look [{below:.3e}, {above:.3e}], as the run stopped on what it saw" in estimate.details()
+    assert " interval {} to {}\n".format(*format_alike(below, above)) in str(estimate)
     assert estimate.to_dict()["sequence"] == [below, above]
     assert (estimate.meets(0.99 * above).decision, estimate.meets(1.01 * above).decision) == ("undecided", "passes")
 
@@ -52,7 +53,7 @@ def test_says_how_large_a_region_may_have_been_missed():
     assert estimate.base_draws == 1000
     assert (1 - estimate.unseen) ** 1000 == pytest.approx(0.05)
     said = "a failure region that no draw met: below 3.0e-03 (1,000 base draws, 95 % confidence)"
-    assert said == estimate.proviso and said in str(estimate)
+    assert said == estimate.proviso and said in estimate.details()
     assert (1 - estimate_adss(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
     assert estimate.to_dict()["unseen"] == estimate.unseen == estimate.unseen_corner
     assert replace(estimate, base_draws=0).unseen == 1
@@ -72,7 +73,7 @@ def test_wide_draws_bound_a_corner_that_was_missed():
 def test_without_a_failure_it_says_which_bound_has_which_level():
     never = samplers.FunctionProblem(lambda x: np.ones(len(x)), 1)
     estimate = samplers.estimate(never, "mc", seed=1, max_sim=1000)
-    data, text = json.loads(estimate.to_json()), str(estimate)
+    data, text = json.loads(estimate.to_json()), estimate.details()
     assert data["cov"] is None and data["gain"] is None  # no infinities
     assert "warning: None of 1,000 simulations failed" in text and "c.o.v. not known" in text and "gain" not in text
     assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
@@ -84,7 +85,8 @@ def test_says_what_the_problem_holds_fixed():
     problem = SimpleNamespace(dim=2, base=problem.base, evaluate=problem.evaluate, given="one die is fixed")
     fixed = samplers.estimate(problem, "mc", seed=1, max_sim=500)
     assert fixed.to_dict()["given"] == "one die is fixed"
-    assert "\n  given that one die is fixed; a failure region that no draw met: below " in str(fixed)
+    assert "\n  given that one die is fixed; a failure region that no draw met: below " in fixed.details()
+    assert "\nGiven        one die is fixed\n" in str(fixed)
     assert samplers.MonteCarlo(n=500).start(problem, seed=1).result().given == "one die is fixed"
 
 

@@ -184,7 +184,9 @@ def test_a_stratum_without_a_failure_raises_the_upper_end_alone():
     above = math.hypot(0.9 * none.interval[1], 0.1 * (some.interval[1] - some.p))
     assert result.interval[1] == pytest.approx(result.p + above)
     assert result.status is Status.CONVERGED and result.warnings == ()
-    assert f"a (90 % of x): p below {none.interval[1]:.1e}, no failure in {none.n_sim:,} simulations" in str(result)
+    assert (
+        f"a (90 % of x): p below {none.interval[1]:.1e}, no failure in {none.n_sim:,} simulations" in result.details()
+    )
     assert any("a may add up to" in text for text in result.remarks)
     assert result.curve([0.0]).high[0] == pytest.approx(result.interval[1], rel=0.05)
     same = result.reweight(even((0.9, 0.1), (40.0, 1.0)).base)
@@ -240,7 +242,7 @@ def test_tiny_budgets(method, max_sim):
     assert result.n_sim <= max_sim and result.interval[0] <= P <= result.interval[1]
     assert (result.status is Status.NO_HITS) == (result.p == 0)
     if max_sim < 3:
-        assert "not simulated" in str(result) and result.parts[0].n_sim == 1  # the largest first
+        assert "not simulated" in result.details() and result.parts[0].n_sim == 1  # the largest first
 
 
 def test_replicates_of_counts_are_pooled_by_stratum():

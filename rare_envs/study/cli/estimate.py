@@ -13,6 +13,7 @@ from typer import Argument, Option
 
 from rare_envs.scenarios.registry import find_scenario, is_highway_env_id
 from rare_envs.study.arguments import (
+    GATE_CODES,
     BadInput,
     ExecutorOptions,
     Question,
@@ -21,7 +22,7 @@ from rare_envs.study.arguments import (
     read_question_file,
 )
 from rare_envs.study.cli import shell
-from rare_envs.study.cli.shell import DOUBTFUL, GATE_CODES, Answer, command, describe_report, option_of
+from rare_envs.study.cli.shell import DOUBTFUL, Answer, command, describe_report, option_of
 
 if TYPE_CHECKING:
     from samplers import Estimate, Executor
@@ -30,7 +31,7 @@ NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
 OPTIONS = frozenset(
     "env ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
-    "workers executor address time_limit memory_limit config env_config out force as_json".split()
+    "workers executor address time_limit memory_limit config env_config out force details as_json".split()
 )
 """Parameters of the command that HighwayEnv's environments have; the others are of the batched simulation."""
 ESTIMATE_FILE = "estimate.safetensors"
@@ -79,7 +80,7 @@ def estimate_command(
                 f"expected {', '.join(rare_envs.ENV_IDS)} with it."
             )
         env_settings = None if env_config is None else read_mapping(env_config)
-        return estimate_highway_env(question, env_settings, out, force, executor)
+        return estimate_highway_env(question, env_settings, out, force, details, executor)
     if env_config is not None:
         raise BadInput(f"Expected --env-config with an environment of HighwayEnv, such as highway-fast-v0, got {env}.")
 
@@ -92,7 +93,7 @@ def estimate_command(
 
 def refuse_without_limit(typed: set[str], limits: str) -> None:
     """Raise a BadInput that names an option about a limit, where there is none."""
-    for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
+    for name, option in (("assume_traffic", "--assume-traffic"), ("gate_confidence", "--confidence")):
         if name in typed:
             raise BadInput(f"Expected {option} together with {limits}, the limit.")
 
@@ -111,7 +112,12 @@ def format_seconds(seconds: float) -> str:
 
 
 def estimate_highway_env(
-    question: Question, config: dict[str, Any] | None, out: Path | None, force: bool, executor: Executor | None
+    question: Question,
+    config: dict[str, Any] | None,
+    out: Path | None,
+    force: bool,
+    details: bool,
+    executor: Executor | None,
 ) -> Answer:
     """Estimate how often an ego crashes in one of HighwayEnv's environments, as that environment draws its traffic."""
     import agents
@@ -143,32 +149,35 @@ def estimate_highway_env(
             try:
                 result = samplers.estimate(problem, method, progress=True, executor=executor, **arguments)
             except samplers.EstimationInterrupted as stopped:
-                known = _describe(question, problem, stopped.estimate, None)
+                known = _describe(question, problem, stopped.estimate, None, details)
                 raise RunInterrupted(describe_stop(stopped.estimate), known) from None
             except KeyboardInterrupt:
                 raise RunInterrupted(FIRST_BATCH) from None
         if file is not None:
-            with writing.unwritten_results(file.parent, _describe(question, problem, result, None)):
+            with writing.unwritten_results(file.parent, _describe(question, problem, result, None, details)):
                 result.save(file)
-    return _describe(question, problem, result, out)
+    return _describe(question, problem, result, out, details)
 
 
-def _describe(question: Question, problem: Any, result: Estimate, out: Path | None) -> Answer:
+def _describe(question: Question, problem: Any, result: Estimate, out: Path | None, details: bool) -> Answer:
     """Return the answer of an estimate in an environment of HighwayEnv."""
     import numpy as np
 
     from rare_envs.study.report import has_exact_bound
+    from samplers.output import MOST_LINES, fold_rows
+    from samplers.result import list_facts, list_warnings
 
     shown = result
     if has_exact_bound(result):  # the warning that nothing failed casts no doubt on the upper end
         shown = replace(result, warnings=(), remarks=(*result.warnings, *result.remarks))
-    lines = [f"{question.env_id}, ego {question.ego}", str(shown), f"  given {HELD}"]
-    likeliest = {}
+    facts, likeliest = [*list_facts(result), ("Given", HELD)], {}
     if len(result.failures):
         named = problem.space.named(result.failures.x[0].round(3))
         likeliest = {name: np.asarray(value).tolist() for name, value in named.items()}
-        lines.append(f"  most likely failure: {', '.join(f'{name} {value}' for name, value in likeliest.items())}")
-    lines += [] if out is None else [f"Wrote {out}."]
+        facts.append(("Failure", f"most likely: {', '.join(f'{name} {value}' for name, value in likeliest.items())}"))
+    facts += [*list_warnings(shown.warnings), *([("Wrote", str(out))] if out else [])]
+    lines = [f"{question.ego} in {question.env_id}", *fold_rows(facts, MOST_LINES - 1)]
+    lines += shown.details().splitlines() if details else []
     about = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
     about["env_config"] = problem.config
     data = {**result.to_dict(), **about, "doubtful": bool(shown.warnings)}
@@ -239,7 +248,7 @@ def plan_command(
 
 @command(
     *("method", "ensemble_run", "device", "seed", *shell.EGO_FILE, "trust", "observation", "action"),
-    *("max_rate", "gate_confidence", "given_base"),
+    *("max_rate", "gate_confidence", "assume_traffic"),
     stopped=NOTHING_MADE,
 )
 def risk_command(
@@ -260,9 +269,11 @@ def risk_command(
     max_sim: Annotated[int | None, option_of("max_sim", help="Largest number of simulations of each scenario.")] = None,
     out: Annotated[Path | None, Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
     force: shell.ForceOption = False,
+    details: shell.DetailsOption = False,
 ) -> Answer:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
     from rare_envs.study.risk import SCENARIO_SET, Risk, risk
+    from rare_envs.study.text import list_gate
 
     if asked["max_rate"] is None:
         refuse_without_limit(typed, "--max-rate")
@@ -274,10 +285,12 @@ def risk_command(
             raise BadInput(f"Expected one --base for each scenario, got several for {owner!r}.")
         bases[owner] = name
 
-    def tell(found: Any, wrote: str = "") -> Answer:
+    def tell(found: Any, *wrote: tuple[str, str]) -> Answer:
         code = DOUBTFUL if found.warnings else 0
         code = code if found.verdict is None else GATE_CODES[found.verdict.decision]
-        return Answer(found.to_dict(), f"{found}{wrote}", code)
+        lines, gate = found.describe(wrote), list_gate(found.verdict)
+        lines[len(lines) - len(gate) :] = [*([found.details()] if details else []), *gate]
+        return Answer(found.to_dict(), "\n".join(lines), code)
 
     with as_bad_input(ValueError), shell.telling_unwritten(Risk, tell):
         found = risk(
@@ -291,7 +304,7 @@ def risk_command(
             max_sim=max_sim,
             **asked,
         )
-    return tell(found, "" if out is None else f"\nWrote {out}.")
+    return tell(found, *([] if out is None else [("Wrote", str(out))]))
 
 
 @command(*shell.ASKED, stopped=NOTHING_MADE)

@@ -9,7 +9,6 @@ import inspect
 import json
 import os
 import re
-import shlex
 import signal
 import sys
 import threading
@@ -25,12 +24,18 @@ from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone, clean_text
 from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
-from rare_envs.study.arguments import BadInput, ExecutorOptions, Question, UnwrittenResults, option_name, read_whole
+from rare_envs.study.arguments import (
+    GATE_CODES,
+    BadInput,
+    ExecutorOptions,
+    Question,
+    UnwrittenResults,
+    option_name,
+    read_whole,
+)
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
-GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
-"""Exit codes of a comparison of p with a limit."""
 LONGEST_LINE = 4_000
 """Characters of an error or a warning: files and names may bring along any number."""
 WHOLE = 1_000
@@ -236,13 +241,8 @@ def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
     """Return the answer of a `Report`, of a run in a folder `out` or of none."""
     from rare_envs.study.text import print_report
 
-    def show() -> None:
-        print_report(report, out, details)
-        if not details:
-            where = "--details" if out is None else f"rare-envs report {shlex.quote(str(out))}"
-            print(clean_text(f"all intervals and parameters: {where}"))
-
     doubtful = DOUBTFUL if report.doubtful else 0
+    show = functools.partial(print_report, report, out, details)
     return Answer(report.to_dict(), show, doubtful if report.verdict is None else GATE_CODES[report.verdict.decision])
 
 

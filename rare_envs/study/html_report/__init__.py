@@ -31,6 +31,7 @@ from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.question import open_run, prepare, warn_of_changed_files
 from rare_envs.study.replay import Drive, drive_again, name_parties, read_row
 from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_finished
+from samplers.output import unfold_rows
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
 from training.fit.filters import read_csv_columns
@@ -219,7 +220,7 @@ def render_page(
         changed = study.changed_files
     doubts = [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
     own, noted = ([str(each) for name in names for each in result.get(name) or []] for names in (["doubts"], NOTED))
-    doubts += [*own, *filter(None, [text.describe_wide_base(result)])]
+    doubts += own
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rare_envs.study.html_report"),
         autoescape=True,
@@ -234,6 +235,7 @@ def render_page(
         about=study.about,
         folder=str(study.folder),
         quoted_folder=shlex.quote(str(study.folder)),
+        answer=unfold_rows(result["text"][1:]),
         doubts=doubts,
         remarks=[each for each in noted if each not in own],
         end=describe_outcome(str(result.get("status")), own),
@@ -251,7 +253,6 @@ def render_page(
         describe_kind=text.describe_kind,
         probability=text.format_probability,
         parties=name_parties,
-        two_digits=lambda number: f"{float(f'{number:.2g}'):,.0f}",
         value=format_value,
         with_interval=text.format_with_interval,
         roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},

@@ -25,7 +25,7 @@ from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.events import EventRate, list_part_errors, sum_people
 from rare_envs.study.report import describe_left_out, find_frequency
 from rare_envs.study.risk import compare_sites
-from rare_envs.study.text import describe_model, format_rate, format_with_interval, list_uncalibrated, tabulate_events
+from rare_envs.study.text import describe_calibration, format_rate, format_with_interval, tabulate_events
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
 
 FEW = {"method": "mc", "max_sim": 400}
@@ -59,8 +59,7 @@ def test_nothing_failed(tmp_path: Path) -> None:
     report = run(prepare(question(base, max_sim=100)))
     assert report.estimate.p == 0.0 == report.rate.per_million_km
     assert report.rate.interval_per_million_km[1] >= 1e6 * 42 / 218 * report.estimate.interval[1]
-    (left_out,) = describe_left_out(report.study, report.estimate)
-    assert left_out.startswith("nothing failed")
+    assert "not known without a failure" in describe_left_out(report.study, report.estimate)
 
 
 def test_what_counts_no_collisions_has_no_rate(bases: dict[str, str]) -> None:
@@ -99,7 +98,7 @@ def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> Non
     assert 0 < low < expected < high
     assert sum(found.kinds.values()) == pytest.approx(expected)
     assert found.notes == ()
-    assert "38 + 15 events of 17 scenes" in str(found)
+    assert "38 + 15 events of 17 scenes" in found.details()
 
 
 def test_bad_input_is_one_line_before_any_simulation(bases: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +135,7 @@ def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.Monkey
     assert one.total.rates[0].site_log_sd == 0.0
     assert two.total.rates[0].site_log_sd == pytest.approx(abs(math.log(factor)) / math.sqrt(2))
     assert two.total.interval_per_million_km[1] > one.total.interval_per_million_km[1]
-    assert ", under i80 " in str(one)
+    assert ", under i80 " in one.details()
 
 
 def test_other_sites_are_known_from_the_same_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,8 +238,9 @@ def test_brakings_of_two_kinds_are_two_events(tmp_path: Path, bases: dict[str, s
     assert found.people.count == 13
     assert [each["event"] for each in found.to_dict()["events"]] == ["slowing", "stop"]
     lines = str(found).splitlines()
-    beside = "; people in the same events 4.0 (2.2 to 6.9); uncalibrated in slowings of the lead, stops of the lead"
-    assert lines[0].endswith(beside) and lines[2].startswith("  slowings of the")
+    assert "; people in the same events 4.0 (2.2 to 6.9)" in " ".join(lines[:2])
+    (whole,) = (line for line in lines if line.startswith("all "))
+    assert whole.endswith(" 4.0 (2.2 to 6.9)") and f" {format_rate(found.total.per_million_km)} (" in whole
 
 
 def test_a_part_without_a_failure_has_an_upper_end(tmp_path: Path) -> None:
@@ -290,11 +290,11 @@ def test_the_calibration_is_that_of_the_base_and_a_miss_by_more_than_three_has_i
     """Contacts of `human` per cut-in over the upper end of people's: 5.572 contacts in 3.2187e6 km."""
     at_home, elsewhere = event_of("us101"), event_of("i80")
     assert (at_home.calibration.base, elsewhere.calibration.base) == ("us101", "i80")
-    assert at_home.uncalibrated == "" == list_uncalibrated([at_home])
+    assert at_home.uncalibrated == ""
     factor = elsewhere.calibration.drivers["human"]["contacts"].p * elsewhere.calibration.per_km * 3.2187e6 / 5.572
     assert factor > 3.0 and elsewhere.uncalibrated == f"uncalibrated, {factor:.2g} times above people's interval"
-    assert describe_model(elsewhere).endswith(f": {elsewhere.uncalibrated}")
-    assert list_uncalibrated([at_home, elsewhere]) == "cut-ins"
+    assert describe_calibration(at_home).endswith("within a factor 3 of people's interval")
+    assert describe_calibration(elsewhere).endswith(f", {factor:.2g} times above people's interval")
 
 
 def test_traffic_that_nobody_calibrated_is_said_to_have_no_calibration(bases: dict[str, str]) -> None:
@@ -307,7 +307,7 @@ def test_traffic_that_nobody_calibrated_is_said_to_have_no_calibration(bases: di
         (event_of("us101", horizon=2.0), "us101 with --horizon"),
     ):
         assert found.calibration is None
-        assert describe_model(found) == f"no calibration of {traffic}"
+        assert describe_calibration(found) == f"not calibrated: human driver model not measured in {Path(traffic).name}"
 
 
 class Policy:

@@ -64,8 +64,9 @@ def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
     assert found.interval is found.expected is None
     half = 2.119905 * math.sqrt(found.spread**2 + result.cov**2 + 0.04)
     assert found.bound == pytest.approx(min(1.0, result.p * math.exp(half)), rel=1e-6)
-    assert "the events do not determine p; nor an upper end in this family" in str(result)
-    assert "predictive mean" not in str(result)
+    assert "the events do not determine p; nor an upper end in this family" in result.details()
+    assert "predictive mean" not in result.details()
+    assert "no lower limit\nLimited by   " in str(result)
     assert "do not determine p; below 1.0e-02 in this family" in str(replace(found, bound=0.01))
 
 
@@ -73,8 +74,10 @@ def test_a_base_without_refits_prints_what_it_did():
     plain, fitted_run = run(normal()), run(BASE)
     assert plain.base_uncertainty is run(fitted()).base_uncertainty is None
     assert plain.to_dict()["base_uncertainty"] is None
-    lines = [line for line in str(fitted_run).splitlines() if "base distribution" not in line and "family" not in line]
-    assert str(plain).splitlines() == lines
+    lines = [
+        line for line in fitted_run.details().splitlines() if "base distribution" not in line and "family" not in line
+    ]
+    assert plain.details().splitlines() == lines
     assert (plain.p, plain.interval, plain.n_sim) == (fitted_run.p, fitted_run.interval, fitted_run.n_sim)
 
 
@@ -94,7 +97,7 @@ def test_where_the_spread_is_not_known_one_sentence_says_why(change, text):
     assert found.interval is found.expected is found.bound is None
     assert math.isnan(found.spread)
     assert text in found.reason
-    assert f"base distribution  no interval: {found.reason}" in str(result)
+    assert f"base distribution  no interval: {found.reason}" in result.details()
     assert json.loads(result.to_json())["base_uncertainty"]["spread"] is None
 
 
@@ -104,7 +107,7 @@ def test_where_the_spread_is_not_known_one_sentence_says_why(change, text):
 def test_after_hardly_any_simulations_one_line_says_what_is_known(method, max_sim, beta):
     result = samplers.estimate(HalfSpace(BASE, beta), method, seed=1, max_sim=max_sim)
     found = result.base_uncertainty
-    (line,) = (each.strip() for each in str(result).splitlines() if "base distribution" in each)
+    (line,) = (each.strip() for each in result.details().splitlines() if "base distribution" in each)
     if found.interval is not None:
         assert 0.0 <= found.interval[0] <= result.p <= found.interval[1] <= 1.0
         assert line.startswith("base distribution 95 %")
@@ -123,7 +126,7 @@ def test_of_a_run_that_was_stopped_the_interval_holds_that_of_the_sampling():
     low, high = result.base_uncertainty.interval
     assert result.n_sim < 3000 and result.failures.total < 40 and result.cov > 0.4
     assert low <= result.interval[0] < result.interval[1] <= high
-    assert str(result).count("base distribution 95 %") == 1
+    assert result.details().count("base distribution 95 %") == 1
 
 
 class Impossible:
@@ -151,10 +154,10 @@ def test_the_further_run_knows_p_of_the_refits_and_leaves_p_as_it_is():
     assert 0 < found.n_sim == result.ensemble_run.n_sim <= 3000  # max_sim limits it anew
     assert np.log(found.value_refits) == pytest.approx(np.log([refit.p for refit in FAR]), abs=0.3)
     assert min(found.ess_refits) > 10
-    assert f"from a further {found.n_sim:,} simulations under their mixture" in str(result)
+    assert f"from a further {found.n_sim:,} simulations under their mixture" in result.details()
     assert sum(ess < 10 for ess in without.base_uncertainty.ess_refits) == 4
     assert without.base_uncertainty.warnings == (
         "4 of 30 refits rest on under 10 effective failing points: the spread is coarse.",
     )
-    assert "warning: 4 of 30 refits" in str(without)
+    assert "\nWarning      4 of 30 refits" in str(without)
     assert result.ensemble_run.p == pytest.approx(np.mean([refit.p for refit in FAR]), rel=0.1)

@@ -61,7 +61,7 @@ def test_decisions(max_p: float, base: BaseUncertainty | None, given: bool, deci
 
 def test_a_warning_that_p_may_be_wrong_leaves_it_undecided() -> None:
     verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4, None)
-    assert verdict.decision == "undecided" and "as a warning says that p may be wrong: weights are un" in str(verdict)
+    assert verdict.decision == "undecided" and "a warning says that p may be wrong: weights are un" in str(verdict)
     doubtful = replace(BASE, warnings=("the spread is coarse.",))
     assert judge_estimate(Known(), 2e-3, doubtful).decision == "undecided"
     few = samplers.estimate(samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1), "mc", seed=0, max_sim=2000)

@@ -19,7 +19,7 @@ def test_above_1000_simulations_the_result_is_that_of_two_stage():
     result = samplers.estimate(problem, seed=4, max_sim=2000)
     assert result == samplers.estimate(problem, "two-stage", seed=4, max_sim=2000)
     assert result.choice == result.to_dict()["choice"] == "two-stage: 2,000 simulations for 2 dimensions"
-    assert "chosen" not in str(result)  # the usual one is not announced
+    assert "chosen" not in result.details()  # the usual one is not announced
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_noise_does_not_count_as_dimensions_and_slow_simulations_are_few(seconds
 def test_subset_simulation_has_the_rest_where_nothing_is_to_be_learned():
     result = samplers.estimate(ring(), seed=1, max_sim=300)
     assert result.choice.startswith("adss: 300 simulations for 50 dimensions, kriging explains ")
-    assert f"chosen {result.choice}" in str(result)
+    assert f"chosen {result.choice}" in result.details()
     assert sum(level.n_sim for level in result.trace) == result.n_sim <= 300
     assert result.trace[0].n_sim == 100 and 0 < result.interval[0] < 1e-3 < result.interval[1] < 0.2
 
@@ -63,7 +63,7 @@ def test_without_a_failure_the_answer_is_a_bound_the_nearest_approach_and_what_t
     result = samplers.estimate(samplers.FunctionProblem(f, 40), seed=0, max_sim=150)
     assert result.p == 0 and result.interval[1] < 0.1
     assert result.closest.f == np.concatenate(seen).min() == 20.0 - np.linalg.norm(result.closest.x[None], axis=1)
-    text = str(result)
+    text = result.details()
     assert f"P[f <= 0] below {result.interval[1]:.1e} (95 %): no failure in 150 simulations" in text
     assert f"The nearest approach was f = {result.closest.f:.3g} at x = (" in text and "--max-sim 2000" in text
     assert result.to_dict()["closest"]["f"] == result.closest.f

@@ -247,8 +247,10 @@ BRAKE = ("estimate", "rare_envs/HardBrake-v0", *FEW)
 def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
     short = " ".join(cli(*BRAKE, "--base", base).stdout.split())
-    assert "per million km (" in short and "per event per million km people in them human model brakings 0.19" in short
+    assert " per million km (" in short and "; people in brakings not counted " in short
+    assert f"human driver model not measured in {Path(base).name} " in short
     text = " ".join(cli(*BRAKE, "--base", base, "--details").stdout.split())
+    assert "per event per million km people in them human model brakings 0.19" in text
     assert "from 0.19 brakings per km; the uncertainty is" in text
     data = json.loads(cli(*BRAKE, "--base", base, "--json").stdout)
     assert data["rate"]["per_million_km"] == pytest.approx(1e6 * 42 / 218 * data["p"])
@@ -260,8 +262,8 @@ def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) ->
         (("--base", base, "--gamma", "1"), "--gamma 1 counts other events"),
         (("--base", write_fitted(here / "b.json", "hard_brake", frequency=None)), "nobody counted"),
     ):
-        [line] = [line for line in cli(*BRAKE, *words).stdout.splitlines() if "no rate" in line]
-        assert said in line
+        shown = " ".join(cli(*BRAKE, *words).stdout.split())
+        assert said in shown.partition("Rate no rate per km: ")[2]
 
 
 def test_p_under_other_bases(cli: Cli, here: Path) -> None:

@@ -50,7 +50,7 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     ((*ESTIMATE, "--max-p", 2), ("Expected --max-p above 0",)),
     ((*ESTIMATE, "--max-p", 0.1, "--confidence", 0.4), ("0.4",)),
     ((*ESTIMATE, "--confidence", 0.9), ("--confidence together with --max-p or --max-rate",)),
-    ((*ESTIMATE, "--given-base"), ("--given-base together with --max-p or",)),
+    ((*ESTIMATE, "--assume-traffic"), ("--assume-traffic together with --max-p or",)),
     ((*ESTIMATE, "--time-limit", 5), ("Expected --time-limit together with --workers",)),
     ((*ESTIMATE, "--workers", 2, "--address", "auto"), ("--address does not go with --executor local",)),
     ((*ESTIMATE, "--workers", 2, "--memory-limit", "nan"), ("a number of GiB above 0, got nan",)),
