@@ -17,7 +17,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.output import StoredMethod, format_alike, read_object, register_stored, write_object
+from samplers.output import StoredMethod, format_alike, read_object, register_stored, unfold_rows, write_object
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 
@@ -78,6 +78,17 @@ def test_without_a_failure_it_says_which_bound_has_which_level():
     assert "warning: None of 1,000 simulations failed" in text and "c.o.v. not known" in text and "gain" not in text
     assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
     assert estimate.proviso == "a failure region that no draw met: below 3.0e-03 (1,000 base draws, 95 % confidence)"
+
+
+@pytest.mark.parametrize("gamma", [0.0, -0.123456789])
+def test_an_answer_is_at_most_twelve_lines_of_under_a_hundred_columns(gamma):
+    estimate = samplers.estimate(half_space(2, 2.0).problem, "mc", gamma=gamma, seed=1, max_sim=2000)
+    told = replace(estimate, given="one die is fixed, " * 30, warnings=("it may be wrong, " * 30, "again", "and again"))
+    for each in (estimate, told):
+        lines = str(each).splitlines()
+        assert len(lines) <= 12 and max(map(len, lines)) < 100 and lines == each.to_dict()["text"].splitlines()
+        assert unfold_rows(lines)[0][0] == f"P[f <= {gamma:g}]"
+    assert "it may be wrong, " in str(told) and "..." in str(told)
 
 
 def test_says_what_the_problem_holds_fixed():

@@ -59,6 +59,14 @@ def test_decisions(max_p: float, base: BaseUncertainty | None, given: bool, deci
     assert json.loads(json.dumps(verdict.to_dict()))["text"] == str(verdict)
 
 
+def test_an_undecided_limit_names_what_would_decide_it() -> None:
+    """The simulations leave 8e-5 to 1.2e-4 open, the events 1e-5 to 1e-3."""
+    few = "; more recordings are needed, not simulations; it passes if the base distribution is exact"
+    assert str(judge_estimate(Known(), 2e-4, BASE)).endswith(few)
+    for base in (None, BASE):
+        assert str(judge_estimate(Known(), 1e-4, base)).endswith("limit 0.0001; more simulations are needed")
+
+
 def test_a_warning_that_p_may_be_wrong_leaves_it_undecided() -> None:
     verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4, None)
     assert verdict.decision == "undecided" and "a warning says that p may be wrong: weights are un" in str(verdict)
