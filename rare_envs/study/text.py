@@ -137,7 +137,7 @@ def tabulate_events(events: Sequence[EventRate], total: exposure.TotalRate | Non
         found = rate.p if rate.interval is None or (rate.p > 0 and resolved) else rate.interval[1]
         p = f"{'' if rate.p > 0 and resolved else 'below '}{min(found / each.share, 1.0):.1e}"
         numbers = format_rate(rate.frequency.per_km * each.share), p
-        name = name_event(each)
+        name = name_event(each).removesuffix(" of the lead")  # a row of less than a hundred columns
         rows.append((name, *numbers, describe_rate(each), describe_people(each.people), describe_model(each)))
     if total is not None:
         whole = format_with_interval(total.per_million_km, total.interval_per_million_km)

@@ -74,7 +74,7 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
     words = ("risk", "idm", *bases, "--method", "mc", "--max-sim", "120", "--seed", "4", "--out")
     stopped = cli(*words, tmp_path / "run")
     assert stopped.exit_code == 130
-    kept = "30 simulations are kept; go on with: the same command again. Done before: cut_in "
+    kept = "30 simulations are kept; go on with: the same command again, without --force. Done before: cut_in "
     assert kept in stopped.stderr
     assert (tmp_path / "run" / "cut_in" / JOURNAL).exists() and not (tmp_path / "run" / "risk.json").exists()
     assert_refused(cli(*words, tmp_path / "run", "--seed", 5), "is of another question", "--force")
