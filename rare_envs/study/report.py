@@ -43,8 +43,6 @@ REACH = 0.5
 """P[f <= g] at the largest threshold."""
 COLLISION_MEASURE = "ttc"
 """The measure to advise: -1 after a collision and above 0 without one."""
-WHOLE = 1_000
-"""Lines of an answer that is not cut."""
 MODEL_NOUN = "traffic model"
 """What a base distribution of scenarios is called."""
 ENSEMBLE_REASON = (
@@ -407,8 +405,6 @@ class Report:
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
         """Return the report as JSON-ready values: question, estimate and the `top` most likely failures."""
-        from rare_envs.study.text import describe_answer  # which imports this
-
         failures, space = self.estimate.failures, self.study.problem.space
         listed = itertools.islice(zip(failures, self.crashes, strict=True), top)
 
@@ -417,7 +413,6 @@ class Report:
 
         return {
             **self.estimate.to_dict(),
-            "text": describe_answer(self, most=WHOLE),
             "question": asdict(self.study.question),
             "average": self.average,
             "proviso": self.estimate.proviso,

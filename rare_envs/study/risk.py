@@ -30,7 +30,7 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import Study, build_problem, prepare
-from rare_envs.study.report import WHOLE, Report, find_frequency, judge_rate
+from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
@@ -136,7 +136,7 @@ class ScenarioRisk:
             "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
-            "report": self.report.to_dict(),
+            "report": text.report_as_json(self.report),
         }
 
 
@@ -258,7 +258,7 @@ class Risk:
             "doubtful": bool(self.warnings),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
-            "text": self.describe(most=WHOLE),
+            "text": self.describe(most=text.WHOLE),
             "version": __version__,
         }
 

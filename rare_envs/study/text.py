@@ -229,6 +229,8 @@ N_UNUSUAL = 3
 """Parameters of the most likely failure that are named at most."""
 NAMED_SHARE = 1e-4
 """Share of p from which on a kind of crash is named."""
+WHOLE = 1_000
+"""Lines of an answer that is not cut."""
 CRASHES = "Crashes"
 """The name of p where it counts collisions of the ego."""
 
@@ -253,6 +255,11 @@ def describe_answer(report: Report, last: Sequence[Row] = (), most: int = MOST_L
     rows = [*facts, *_list_rates(report), (what, _describe_crashes(report)), missed]
     head = textwrap.wrap(title, WIDTH, subsequent_indent="  ")
     return [*head, *fold_rows([*rows, *list_warnings(report.warnings), *last], most - len(head))]
+
+
+def report_as_json(report: Report) -> dict[str, Any]:
+    """Return a report as values of JSON, with the whole answer as `text`."""
+    return {**report.to_dict(), "text": describe_answer(report, most=WHOLE)}
 
 
 def name_p(question: Question) -> str:

@@ -30,6 +30,7 @@ from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import SEVERE, save_pictures, saved_figure
 from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question, note_question, read_about
 from rare_envs.study.report import Report
+from rare_envs.study.text import report_as_json
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
@@ -192,7 +193,7 @@ def write_run(folder: Path, report: Report) -> None:
         'no_hits'
     """
     space, faults, kinds = report.study.problem.space, report.faults, report.kinds
-    replace_text(folder / run_folder.RESULT, format_json(report.to_dict()) + "\n")
+    replace_text(folder / run_folder.RESULT, format_json(report_as_json(report)) + "\n")
     nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in run_folder.CRASH[1:]))
     write_failures(folder, space, report.estimate.failures, [_list_crash(each) or nobody for each in report.crashes])
     for name in (run_folder.FAULTS, run_folder.FAULT_BLOCKS, *run_folder.PICTURES):
