@@ -397,7 +397,7 @@ def save_risk_plot(
     rows = [_make_row(each) for each in events] + [RateRow("all of these", total.per_million_km, ends, people)]
     with saved_figure(path, 1.8 + 0.75 * len(rows), 7.0) as figure:
         said = format_with_interval(total.per_million_km, ends, " collisions per million km", level)
-        figure.suptitle(f"{ego}: {said}", fontweight="bold", wrap=True)
+        figure.suptitle(f"{ego}\n{said}", fontweight="bold")
         draw_rates(figure.subplots(), rows)
 
 
