@@ -101,9 +101,7 @@ def read_file(path: Path, *entries: str) -> tuple[dict[str, Any], dict[str, Tens
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
-        zipped = zipfile.is_zipfile(path)
-        pickled = " It looks like a file of torch.save; such files can run code and are not read." * zipped
-        raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: {error}.{pickled}") from None
+        raise _no_safetensors(path, str(error)) from None
     texts = [header[entry] for entry in entries if entry in header]
     if not texts:
         raise ValueError(f"{str(path)!r} holds tensors but no {entries[0]}: save drivers with agents.save_driver.")
@@ -111,12 +109,20 @@ def read_file(path: Path, *entries: str) -> tuple[dict[str, Any], dict[str, Tens
     return parse_json_object(texts[0], f"The header of {str(path)!r}"), tensors
 
 
+def _no_safetensors(path: Path, why: str) -> ValueError:
+    """Return the error for a file of another format, or a damaged one."""
+    pickled = " It looks like a file of torch.save; such files can run code and are not read."
+    return ValueError(
+        f"{str(path)!r} is not a safetensors file, or is damaged: {why}.{pickled * zipfile.is_zipfile(path)}"
+    )
+
+
 def _check_header(path: Path) -> None:
     """Refuse what is no ordinary file, and one that is larger than a network, or has a larger list of its tensors."""
     with open_ordinary(path, MAX_NETWORK_BYTES) as file:
         size = int.from_bytes(file.read(8), "little")
     if size > MAX_HEADER_BYTES:
-        raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: a header of {size:,} bytes.")
+        raise _no_safetensors(path, f"a header of {size:,} bytes")
 
 
 def holds_vision(path: str | PathLike[str]) -> bool:

@@ -173,6 +173,8 @@ def end_soon(code: int) -> None:
         signal.signal(number, signal.SIG_IGN)
 
     def end() -> None:
+        if threading.main_thread().is_alive():  # somebody called the command in a process of their own
+            return
         print_stderr(f"rare-envs: done; something that the ego started does not end, and was left after {LINGER:g} s")
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()

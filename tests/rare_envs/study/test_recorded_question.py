@@ -83,6 +83,9 @@ def change_question(folder: Path, **changes: Any) -> dict[str, Any]:
     result = json.loads((folder / RESULT).read_text())
     result["question"] = {**result["question"], **changes}
     (folder / RESULT).write_text(json.dumps(result))
+    about = json.loads((folder / STUDY).read_text())
+    about.pop("results", None)  # digests, which a sender would write anew
+    (folder / STUDY).write_text(json.dumps(about))
     return dict(result["question"])
 
 

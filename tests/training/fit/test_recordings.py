@@ -36,8 +36,9 @@ def simulated():
     return simulate(0, lanes=3, per_lane=12, seconds=20.0, changers=0.8)
 
 
-def fit(out, between=None, scenarios=None, **source):
-    return fit_bases(EventOptions(**source, between=between), out, scenarios=scenarios, n_refits=2, progress=True)
+def fit(out, between=None, scenarios=None, force=False, **source):
+    options = {"scenarios": scenarios, "n_refits": 2, "progress": True, "force": force}
+    return fit_bases(EventOptions(**source, between=between), out, **options)
 
 
 def write_events(path, rows):
@@ -145,7 +146,7 @@ def test_too_few_events_are_an_error_that_names_all_scenarios(simulated, quick, 
     path = write_coifman(tmp_path / "i80.mat", coifman_matrix(simulated))
     capsys.readouterr()
     with pytest.raises(ValueError, match="too few"):  # there is no lateral offset
-        fit(tmp_path, scenarios=["cut_in"], coifman=path)
+        fit(tmp_path, scenarios=["cut_in"], coifman=path, force=True)
     read, events = capsys.readouterr().err.splitlines()
     assert "rows read" in read and events.startswith("cut_in: ") and events.endswith(" events; fitting")
 

@@ -140,7 +140,7 @@ def test_the_shared_command_line_trains_drivers(monkeypatch, tmp_path, capsys):
 def test_logs_go_to_tensorboard(data, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "torch.utils.tensorboard", None)
-        with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):
+        with pytest.raises(ValueError, match=r"pip install .*\[logs\]"):
             train_learner(make_learner(data, TINY), tmp_path, log=True)
     pytest.importorskip("tensorboard", reason="the extra logs is optional")
     train_learner(make_learner(data, tiny(updates=2)), tmp_path, log=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +130,7 @@ def test_an_ego_is_trained_in_all_scenarios_of_risk(cli: Cli, tmp_path: Path) ->
     words = ("--steps", 16, "--num-envs", 8, "--algo", "a2c", "--horizon", 0.5, "--out", ego)
     printed = cli("train-ego", "all", *words, "--base", "us101").stdout
     assert printed.endswith(f"Next: rare-envs risk {ego} --base cut_in=us101 --base hard_brake=us101\n")
-    answer = json.loads(cli("train-ego", "HardBrake-v0", "CutIn-v1", *words, "--shares", "--json").stdout)
+    answer = json.loads(cli("train-ego", "HardBrake-v0", "CutIn-v1", *words, "--force", "--shares", "--json").stdout)
     assert answer["env_id"] == ["rare_envs/HardBrake-v0", "rare_envs/CutIn-v1"]
 
 
@@ -148,7 +149,7 @@ def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest
     assert json.loads(answer.stdout) == {"bases": [str(file)]}
     assert "progress" in answer.stderr
     given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["cut_in"], "n_refits": 3}
-    assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True}
+    assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True, "force": False}
     assert cli("fit", *words, "--force").stdout == f"{file}: rare-envs estimate ENV --base {file}\n"
 
 
@@ -172,7 +173,7 @@ def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.Monkey
     pytest.importorskip("onnx", reason="the extra onnx is optional")
     report = json.loads(cli("export-ego", model, out, "--json").stdout)
     assert report["onnx"] == str(out) and report["largest_difference"] <= report["tolerance"]
-    assert cli("export-ego", model, out).stdout == (
+    assert cli("export-ego", model, out, "--force").stdout == (
         f"Wrote {out}: its actions differ by {report['largest_difference']:.1e} at most on 1,440 random observations.\n"
     )
 
@@ -210,8 +211,10 @@ def test_all_failures_replay_and_another_ego_takes_them(cli: Cli, run: Path) -> 
     assert one.stdout.splitlines()[-1] == "The ego was egos_here:coasting; that of the run had f = -1."
     table = (run / "failures.csv").read_text()
     (run / "failures.csv").write_text(table.replace(",-1.0,", ",-0.5,", 1))  # f of the first
-    with pytest.warns(UserWarning, match=r"Not what the run in 'run' wrote, .*: failures\.csv\."):
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
         changed = cli("replay", run, "--all")
+    assert "Not what the run in 'run' wrote" in changed.stderr and "failures.csv." in changed.stderr
     assert changed.exit_code == 3 and changed.stdout.count("\n") == 2
 
 
