@@ -138,8 +138,10 @@ class VirtualLink:
         self.questions += 1
         if episode_start[0] and ((gap > 30) & (gap < 32)).any():
             self.hangs = True
+            raise RuntimeError
         if episode_start[0] and ((gap > 40) & (gap < 42)).any() and self.timeout < 2.0:
             self.hangs = True
+            raise RuntimeError
         return np.full((len(observation), 2), -0.1, np.float32), 1 if self.memory else None
 
     def request(self, content: bytes, timeout: float) -> bytes:
