@@ -141,12 +141,9 @@ class PaddedBase(DrawnByItsMap):
     def noise(self) -> NDArray[np.bool_]:
         """Columns that need not be searched: all but those that matter to the problem."""
         own = getattr(self.own, "noise", None)  # a user's base need not have it
-        return np.concatenate([[True], np.full(self.size, False) if own is None else own, self._rest == 1])
-
-    @property
-    def _rest(self) -> FloatArray:
-        """Ones for the standard normal columns."""
-        return np.ones(self.dim - 1 - self.size)
+        return np.concatenate(
+            [[True], np.full(self.size, False) if own is None else own, np.full(self.dim - 1 - self.size, True)]
+        )
 
     def _split(self, x: FloatArray) -> list[FloatArray]:
         return np.split(x, [1, 1 + self.size], axis=1)

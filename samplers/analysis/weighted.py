@@ -119,18 +119,16 @@ def find_missed(
     for part in parts:
         end = first + part.n_units
         here = (units >= first) & (units < end)
-        own, all_of_it = (_count_units(units[here] - first, each[here]) for each in (terms, weights))
+        own, all_of_it = (
+            effective_number(np.bincount(units[here] - first, weights=each[here]).astype(np.float64))
+            for each in (terms, weights)
+        )
         first = end
         if not part.resolved or own < MIN_UNITS:
             draws = round(all_of_it) if part.resolved else 0
             squares += (part.share * part.interval[1] * bound_missed([(1.0, draws)], confidence)) ** 2
             names.append(part.name)
     return math.sqrt(squares), names
-
-
-def _count_units(units: NDArray[np.int64], terms: FloatArray) -> float:
-    """Return the effective number of units behind terms (k,) of points of these units (k,)."""
-    return effective_number(np.bincount(units, weights=terms).astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
