@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
 OPTIONS = frozenset(
-    "env ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
+    "env env_id ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
     "workers executor address time_limit memory_limit config env_config out force details as_json".split()
 )
-"""Parameters of the command that HighwayEnv's environments have; the others are of the batched simulation."""
+"""Options, typed or of a file, that HighwayEnv's environments have; the others are of the batched simulation."""
 ESTIMATE_FILE = "estimate.safetensors"
 """File in the folder of `--out`; `samplers.Estimate.load` reads it."""
 HELD = "HighwayEnv's environment as it is: what it holds fixed is held; rare_envs.highway_env_problem varies it too"
@@ -71,7 +71,7 @@ def estimate_command(
     with as_bad_input(ValueError):
         executor = ExecutorOptions(**of_executor).make()
     if is_highway_env_id(question.env_id):
-        refused = sorted(typed - OPTIONS)
+        refused = sorted((typed | set(given)) - OPTIONS)
         if refused:
             import rare_envs
 

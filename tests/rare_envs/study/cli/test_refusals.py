@@ -58,6 +58,7 @@ REFUSED: tuple[tuple[tuple[Any, ...], tuple[str, ...]], ...] = (
     ((*ESTIMATE, *CUDA), ("'cuda:99' is not here", "take 'cpu'")),
     (("estimate", "merge-v0", "--base", "us101"), ("has no --base", "CutIn-v0")),
     (("estimate", "highway-fast-v0", "--weather"), ("has no --weather",)),
+    (("estimate", "highway-fast-v0", "--config", "limit.yaml"), ("has no --max-p",)),
     (("estimate", "highway-fast-v0", "--measure", "braking"), ("'braking'",)),
     (("compare", "idm", "human", FOLLOWING), ("the same x, got 3 and", "estimate each by itself")),
     (("compare", "idm", "idm", FOLLOWING, "--collisions", "none"), ("none",)),
@@ -132,6 +133,7 @@ def test_bad_input_is_one_line_and_leaves_no_file(
     shutil.copytree(finished_run, here / "run")
     for name in ("cut_in", "hard_brake"):
         write_fitted(here / f"{name}.json", name)
+    (here / "limit.yaml").write_text("max_p: 0.001\n", encoding="utf-8")
     (here / "kept").mkdir()
     for name in ("kept/a.onnx", "old.gif", "old.xodr"):
         (here / name).write_text("mine", encoding="utf-8")
