@@ -109,8 +109,9 @@ def read_numbers(values: Any, wanted: str) -> NDArray[np.float64]:
 def _to_float64(values: Any) -> NDArray[np.float64]:
     """Return values as `read_numbers` does; a TypeError for what is no number."""
     values, mask = values.detach().cpu() if hasattr(values, "detach") else values, np.ma.getmask(values)  # of torch
-    if isinstance(values, list | tuple) and any(not is_number(one) and np.ndim(one) == 0 for one in values):
-        values = np.array([_read_cell(cell) for cell in values])
+    if isinstance(values, list | tuple) and not all(map(is_number, values)):
+        rows = [isinstance(one, list | tuple) or np.ndim(one) > 0 for one in values]
+        values = np.array([(_to_float64 if row else _read_cell)(one) for one, row in zip(values, rows, strict=True)])
     array = np.asarray(values)
     if array.dtype.kind == "O":
         array = np.array([_read_cell(cell) for cell in array.flat]).reshape(array.shape)
@@ -472,7 +473,9 @@ class FunctionProblem:
         try:
             f = self.f(x)
         except Exception as error:  # the function is the user's
-            if (len(x) > 1 or self.chunk_size == 1) and _takes_one_point(self.f, x):  # of few of the attempts at a row
+            if "takes_one_point" not in vars(self) and (len(x) > 1 or self.chunk_size == 1):  # asked once: f may be slow
+                object.__setattr__(self, "takes_one_point", _takes_one_point(self.f, x))
+            if vars(self).get("takes_one_point"):
                 raise EvaluationError(f"f raised {type(error).__name__} ({error}): {hint}") from error
             raise
         try:

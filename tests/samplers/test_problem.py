@@ -55,6 +55,13 @@ def cells(values, missing):
     return [missing if math.isnan(value) else value for value in values.tolist()]
 
 
+def test_rows_in_a_list_are_read_as_they_are_alone():
+    rows = [np.ma.masked_array([1e20, 2.0], [True, False]), [3.0, None]]
+    np.testing.assert_array_equal(samplers.problem.read_numbers(rows, "terms"), [[np.nan, 2.0], [3.0, np.nan]])
+    with pytest.raises(samplers.EvaluationError, match="booleans"):
+        samplers.problem.read_numbers([[1.0, True], [2.0, False]], "terms")
+
+
 MISSING = {
     "masked": np.ma.masked_invalid,
     "masked numbers": lambda f: np.ma.array(np.nan_to_num(f, nan=-9999).round(), mask=np.isnan(f), dtype=int),
