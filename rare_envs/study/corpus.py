@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -176,6 +177,9 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
             if not path.exists():
                 replace_text(path, failure.to_json())
                 new += 1
+    with contextlib.suppress(BadInput):
+        open_run(study, trust=False)  # what needed trust needs it again
+        for failure in chosen:
             note_question(read_question(failure.question_values()))
     return chosen, new
 
@@ -227,7 +231,7 @@ class Trial:
 
 def try_ego(
     failures: Sequence[StoredFailure],
-    folder: Path,
+    folder: Path | None,
     ego: str,
     *,
     algo: str | None = None,
@@ -236,11 +240,17 @@ def try_ego(
     action: str | None = None,
     trust: bool = False,
 ) -> tuple[list[Trial], float]:
-    """Return a trial of an ego in each of some scenarios from a folder, and the wall time of all [s]."""
+    """Return a trial of an ego in each of some scenarios from a folder, and the wall time of all [s].
+
+    The folder's questions are judged by `open_question`; None for those of a run that the caller has opened.
+    """
     worlds: dict[str, list[int]] = {}
     for number, failure in enumerate(failures):
         worlds.setdefault(json.dumps(failure.question_values(), sort_keys=True), []).append(number)
-    questions = [open_question(json.loads(text), folder, trust) for text in worlds]
+    questions = [
+        open_question(asked, folder, trust) if folder else replace(read_question(asked), trust=trust)
+        for asked in map(json.loads, worlds)
+    ]
     start = time.perf_counter()
     trials: dict[int, Trial] = {}
     with as_bad_input(ValueError, OSError, ImportError), np.errstate():

@@ -101,7 +101,7 @@ def replay_all(folder: Path, ego: str | None, trust: bool) -> Answer:
     if not failures:
         raise BadInput(f"The run in {str(folder)!r} has no failure.")
     if ego is not None:
-        return _describe_tries(*try_ego(failures, folder, ego, trust=trust), ego)
+        return _describe_tries(*try_ego(failures, None, ego, trust=trust), ego)
     with as_bad_input(ValueError, OSError):
         trials = try_world(prepare(open_run(run, trust)).problem, failures)
     different = [trial for trial in trials if not trial.same]

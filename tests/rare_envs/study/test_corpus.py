@@ -110,6 +110,7 @@ def test_code_of_a_corpus_from_elsewhere_waits_for_trust(here: Path) -> None:
     assert not (here / "ran").exists()
     trials, _ = try_ego([foreign], here, "idm", trust=True)
     assert (here / "ran").exists() and trials[0].outcome == "failed"
+    assert try_ego([foreign], None, "idm")[0][0].outcome == "failed"  # of a run that was opened
 
 
 def test_what_cannot_be_driven_is_one_line(tmp_path: Path) -> None:
