@@ -122,13 +122,25 @@ def as_errors() -> Iterator[None]:
     except (Exception, EgoGone):
         raise
     except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) and _is_of_signal(error):
+        if not any(map(_is_of_signal, _list_causes(error))):
+            raise CodeEnded(repr(error)) from error
+        if isinstance(error, KeyboardInterrupt):
             raise
-        raise CodeEnded(repr(error)) from error
+        raise KeyboardInterrupt from error
+
+
+def _list_causes(error: BaseException) -> list[BaseException]:
+    """Return an exception and those in whose handling it was raised."""
+    found = [error]
+    for each in found:  # which grows
+        found += [one for one in (each.__cause__, each.__context__) if one is not None and one not in found]
+    return found
 
 
 def _is_of_signal(error: BaseException) -> bool:
-    """Return whether no statement raised an exception, but for one in a signal's handler."""
+    """Return whether it is a KeyboardInterrupt that no statement raised, but for one in a signal's handler."""
+    if not isinstance(error, KeyboardInterrupt) or error.__traceback__ is None:
+        return False
     handlers = [getattr(signal.getsignal(number), "__code__", None) for number in signal.valid_signals()]
     last, *others = [(trace.tb_frame.f_code, trace.tb_lasti) for trace in _walk(error.__traceback__)][::-1]
     in_handler = any(code in handlers for code, _ in (last, *others))

@@ -1,11 +1,12 @@
 """Modules of a user by name: found in the working directory, and every way to fail is one line."""
 
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
-from rare_envs.plugins import did_you_mean, import_module, import_object
+from rare_envs.plugins import CodeEnded, as_errors, did_you_mean, import_module, import_object
 
 
 @pytest.fixture
@@ -44,6 +45,21 @@ def test_what_cannot_be_imported_is_one_line(own_module: str) -> None:
             import_object(spec, "the ego 'x'")
         assert "\n" not in str(caught.value)
     assert sys.path == before
+
+
+@pytest.mark.parametrize("other", [KeyboardInterrupt, SystemExit])
+def test_an_interruption_by_the_user_that_code_raises_again_stays_one(other: type[BaseException]) -> None:
+    def stop(by_user: bool) -> None:
+        try:
+            if by_user:
+                signal.raise_signal(signal.SIGINT)
+        finally:
+            raise other("stopped")
+
+    with pytest.raises(KeyboardInterrupt), as_errors():
+        stop(by_user=True)
+    with pytest.raises(CodeEnded), as_errors():
+        stop(by_user=False)
 
 
 def test_names_are_suggested_without_their_namespace() -> None:
