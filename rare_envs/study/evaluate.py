@@ -363,7 +363,7 @@ def resume(
     """Continue an interrupted run; the answer is that of an undisturbed one."""
     journal, question = writing.continue_journal(folder, mend)
     with contextlib.closing(journal), output_folder(folder, *RESULT_FILES):
-        if (part_of := journal.head.get("part_of")) not in ("", "risk"):
+        if (part_of := journal.head.get("part_of", "")) not in ("", "risk"):
             raise BadInput(f"{str(folder)!r} is of rare-envs {part_of}, which goes on with {writing.SAME_AGAIN}")
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
