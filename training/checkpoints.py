@@ -20,7 +20,7 @@ import torch
 from rare_envs.files import open_ordinary, replace_file
 from rare_envs.plugins import one_line
 
-CHECKPOINT_FORMAT = 3
+CHECKPOINT_FORMAT = 4
 """Version of the file."""
 COUNTERS = "num_timesteps _n_updates _episode_num _n_calls exploration_rate _current_progress_remaining".split()
 """Attributes of a model that count, where its algorithm has them."""
