@@ -473,7 +473,7 @@ class FunctionProblem:
         try:
             f = self.f(x)
         except Exception as error:  # the function is the user's
-            if "takes_one_point" not in vars(self) and (len(x) > 1 or self.chunk_size == 1):  # asked once: f may be slow
+            if "takes_one_point" not in vars(self) and (len(x) > 1 or self.chunk_size == 1):  # asked once
                 object.__setattr__(self, "takes_one_point", _takes_one_point(self.f, x))
             if vars(self).get("takes_one_point"):
                 raise EvaluationError(f"f raised {type(error).__name__} ({error}): {hint}") from error

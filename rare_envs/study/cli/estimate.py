@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
 OPTIONS = frozenset(
-    "env env_id ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon chunk "
-    "workers executor address time_limit memory_limit config env_config out force details as_json".split()
+    "env env_id ego algo stats trust method measure gamma seed max_sim target_cov replicates on_error noise horizon "
+    "chunk workers executor address time_limit memory_limit config env_config out force details as_json".split()
 )
 """Options, typed or of a file, that HighwayEnv's environments have; the others are of the batched simulation."""
 ESTIMATE_FILE = "estimate.safetensors"
