@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from types import ModuleType, TracebackType
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 _ODD, _JOINERS = re.compile(r"[^\n -~]"), "\u200c\u200d"
 """Letters to look at, and those without a width that words of some languages need."""
@@ -160,6 +160,9 @@ class EgoGone(BaseException):
 
 class NoAnswer(RuntimeError):
     """The ego has not answered in time, or has died: perhaps because of one of the rows of the query."""
+
+    waits: ClassVar[bool] = True
+    """Each costs its time, or a process that starts again; `samplers` reads this attribute."""
 
 
 def reason_of(error: BaseException) -> str:

@@ -8,6 +8,7 @@ counted. `samplers.executors` has the workers.
 
 from __future__ import annotations
 
+import math
 import random
 import sys
 import time
@@ -88,19 +89,23 @@ def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable
     are as large as lets no more than a tenth of the chunk and of the rows done be in parts that raise: it all takes 1.2
     attempts a row at most, and the fewer calls the fewer rows raise. A row that has given nothing is attempted once
     more; if that gives nothing either, `fail(row, reason, error)` is told, which may raise.
-    """
-    n_retried, lost, found = 0, dict[int, str](), list[tuple[NDArray[np.int64], Result]]()
 
-    def go_through(rows: NDArray[np.int64], again: bool) -> None:
-        nonlocal n_retried
+    Where an error means that an answer was waited for (its attribute `waits`), attempts are cheaper than errors: then
+    parts of the root of the chunk, and each row alone of a part that raises.
+    """
+    n_retried, lost, unsure = 0, dict[int, str](), dict[int, str]()
+    found = list[tuple[NDArray[np.int64], Result]]()
+    for second in (False, True):
+        again, rows = second, np.array(sorted(unsure), dtype=np.int64) if second else np.arange(len(chunk))
         size, spare = len(rows), WASTED_SHARE * len(rows)
+        waited, alone, root = False, 0, math.isqrt(len(chunk))
         while len(rows):
             part = rows[:size]
             n_retried += len(part) if again else 0
             try:
                 found.append((part, attempt(chunk if len(part) == len(chunk) else chunk.take(part))))
                 spare += WASTED_SHARE * len(part)
-                rows = rows[size:]
+                rows, alone = rows[size:], alone - len(part)
             except (Exception, SystemExit) as error:  # the simulation is the user's: anything may happen in it
                 if getattr(error, "final", False):  # calling f again cannot help
                     raise
@@ -108,14 +113,14 @@ def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable
                     lost[int(part[0])] = reason_of(error)
                     fail(int(part[0]), lost[int(part[0])], error)
                     found.append((part, Result(np.full((1, 1), np.nan), {})))
-                    rows = rows[1:]
+                    rows, alone = rows[1:], alone - 1
+                waited = waited or getattr(error, "waits", False)
+                alone = len(part) if waited and 1 < len(part) <= root else alone
                 spare -= len(part) if again and len(part) > 1 else 0.0
                 again = True
-            size = max(1, int(spare / 2))
-
-    go_through(np.arange(len(chunk)), again=False)
-    unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
-    go_through(np.array(sorted(unsure), dtype=np.int64), again=True)
+            size = max(1, int(spare / 2)) if not waited else root if alone <= 0 else 1
+        if not second:
+            unsure = {int(rows[at]): why for rows, each in found for at, why in each.notes.get("reasons", {}).items()}
     whole = join_results([each for _, each in found])
     table = np.empty((len(chunk), whole.table.shape[1]))
     table[np.concatenate([rows for rows, _ in found])] = whole.table  # what came last stands

@@ -91,7 +91,7 @@ def test_p_is_conditional_on_fixed_noise_and_says_so() -> None:
     for noise, drivers, given in (("fixed", "mgail", True), ("fixed", None, False), (True, "mgail", False)):
         problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", drivers=drivers, noise=noise, horizon=1.0)
         result = samplers.estimate(problem, "mc", gamma=2.0, seed=0, max_sim=50)
-        assert ("given that the drivers' noise is one fixed sequence" in " ".join(str(result).split())) == given
+        assert ("Given the drivers' noise is one fixed sequence" in " ".join(str(result).split())) == given
 
 
 @pytest.mark.parametrize("env_id", [env_id for env_id in SCENARIOS if SCENARIOS[env_id].drivers is None])
