@@ -359,7 +359,12 @@ def _make(path: Path) -> None:
 
 
 def _check_own(path: Path) -> None:
-    """Refuse a journal that is a link or a pipe or has another name too, as SQLite writes in place."""
+    """Refuse a journal that is a link or a pipe or has another name too, as SQLite writes in place.
+
+    A rollback journal beside it, which names a file that SQLite removes, is of somebody else: none stays in WAL mode.
+    """
+    if os.path.lexists(rollback := f"{path}-journal"):
+        raise JournalError(f"There is {rollback!r}, which no run leaves and which may remove other files: remove it.")
     for name in _list_files(path):
         with contextlib.suppress(FileNotFoundError):
             found = os.lstat(name)
