@@ -119,14 +119,13 @@ def journals_of(
         if out is None:
             yield [None for _ in questions]
             return
-        stack.enter_context(output_folder(out, *results))
+        stack.enter_context(output_folder(out, *results, folders=filter(None, questions)))
         parts, journals = {out / name: question for name, question in questions.items()}, list[Journal]()
         if force:
             clear_runs(parts)
             for name in results:
                 (out / name).unlink(missing_ok=True)
         for folder, question in parts.items():
-            stack.enter_context(output_folder(folder))
             journal = begin_journal(folder, question, part_of=command)
             journals.append(stack.enter_context(contextlib.closing(journal)))
         try:
