@@ -121,7 +121,13 @@ def read_members(path: str | Path, names: Container[str] | None = None) -> dict[
                 unpacked = sum(member.file_size for member in members)
                 if unpacked > max(MAX_UNPACKED, MAX_RATIO * size):
                     raise ValueError(f"it would unpack from {size / 1e6:,.1f} to {unpacked / 1e6:,.0f} MB")
-                return {member.filename: archive.read(member) for member in members}
+                if not {member.compress_type for member in members} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+                    raise ValueError("it is packed by another method than deflate, which may unpack without bound")
+                found = dict[str, bytes]()
+                for member in members:
+                    with archive.open(member) as unpacking:  # the size that it states is no bound of a plain read
+                        found[member.filename] = unpacking.read(member.file_size)
+                return found
         except Exception as error:  # the archive and each kind of compression have errors of their own
             raise ValueError(f"{str(path)!r} is damaged: {error}.") from error
 
@@ -143,7 +149,7 @@ def open_parquet(path: str | Path) -> Iterator[pyarrow.parquet.ParquetFile]:
             file.seek(0)
             with pyarrow.parquet.ParquetFile(file) as table:  # Arrow itself opens names in UTF-8 only
                 yield table
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, KeyError, pyarrow.lib.ArrowException) as error:  # of damaged tables
         raise ValueError(f"Cannot read {str(path)!r}: {' '.join(str(error).split())}") from error
 
 

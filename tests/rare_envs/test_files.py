@@ -142,6 +142,10 @@ def test_what_unpacks_to_far_more_than_its_size_is_refused(tmp_path: Path) -> No
             archive.writestr(str(number), b"")
     with pytest.raises(ValueError, match="more than 10,000 members"):
         read_members(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:  # which unpacks before its size is known
+        archive.writestr("data", bytes(1000))
+    with pytest.raises(ValueError, match="another method than deflate"):
+        read_members(path)
     for text in ("[" + "[]," * MAX_VALUES, '{"a": 1' + ',"a":1' * MAX_VALUES):
         with pytest.raises(ValueError, match="the file has more than 500,000 values"):
             parse_json_object(text, "the file")
