@@ -86,6 +86,10 @@ class OnnxEgo:
         except Exception as error:  # onnxruntime's own exceptions have no common class
             raise ValueError(f"Cannot load {str(path)!r} as ONNX: {one_line(error)}.") from error
         self.path, inputs, outputs = path, self._session.get_inputs(), self._session.get_outputs()
+        for port in inputs:
+            if math.prod(size for size in port.shape if isinstance(size, int)) > _MOST_ENTRIES:
+                at_most = f"of at most {_MOST_ENTRIES:,} numbers, got {port.shape}"
+                raise ValueError(f"Expected input {port.name!r} of {str(path)!r} to be {at_most}.")
         self._masks = [port for port in inputs if _MASK.fullmatch(port.name)]
         inputs = [port for port in inputs if port not in self._masks]
         if not inputs or not outputs:
@@ -201,8 +205,7 @@ def _find_batch_axis(port: Any, batch: Any, path: Path) -> int:
         free = [axis for axis, size in enumerate(port.shape[:2]) if size == (batch if isinstance(batch, int) else 1)][
             :1
         ]
-    entries = math.prod(size for size in port.shape if isinstance(size, int))
-    if port.type not in _TYPES or len(port.shape) < 2 or len(free) != 1 or entries > _MOST_ENTRIES:
+    if port.type not in _TYPES or len(port.shape) < 2 or len(free) != 1:
         raise ValueError(
             f"Expected input {port.name!r} of {str(path)!r} to be numbers of shape (batch, fixed sizes), got "
             f"{port.type} {port.shape}."
