@@ -134,7 +134,7 @@ def find_ego_kind(spec: str) -> str:
 
 def names_function(spec: str) -> bool:
     """Return whether a name has the form of `module:function`, which a file may have too."""
-    return ":" in spec and "/" not in spec and spec.partition(":")[0] not in RULE_BASED_EGOS
+    return ":" in spec and not {"/", "\\"} & {*spec} and spec.partition(":")[0] not in RULE_BASED_EGOS
 
 
 def strip_prefixes(spec: str) -> str:

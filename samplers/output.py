@@ -87,6 +87,8 @@ def write_object(path: str | PathLike[str], value: object) -> None:
     text, draft = json.dumps(_encode(value, arrays), allow_nan=False), Path(f"{path}.{secrets.token_hex(8)}.part")
     try:
         save_file(arrays, str(draft), metadata={"format": FILE_FORMAT, _KEY: text})
+        with suppress(FileNotFoundError):  # others may do no more with it than with the one before
+            draft.chmod(Path(path).lstat().st_mode & draft.stat().st_mode)
         draft.replace(path)  # of a link, which is not followed, as of a file
     except (SafetensorError, OSError) as error:
         raise OSError(f"Cannot write {str(path)!r}: {error}") from error

@@ -380,8 +380,9 @@ def read_mapping(path: Path) -> dict[str, Any]:
     try:
         value = None if node is None else yaml.SafeLoader("").construct_document(node)
         json.dumps(value, allow_nan=False)  # as the answer repeats it
-    except (yaml.YAMLError, RecursionError, TypeError, ValueError) as error:
-        raise BadInput(f"Expected {str(path)!r} to have texts, finite numbers and lists of them: {error}.") from error
+    except Exception as error:  # each tag, such as !!int, has errors of its own
+        words = f"Expected {str(path)!r} to have texts, finite numbers and lists of them"
+        raise BadInput(f"{words}: {' '.join(str(error).split())}.") from error
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise BadInput(f"Expected {str(path)!r} to have keys and values, as in vehicles_count: 20.")
     return value
