@@ -11,18 +11,18 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 54_520,
-    "code lines": 34_380,
+    "package lines": 56_250,
+    "code lines": 35_600,
     "modules": 220,
-    "functions": 3_075,
-    "classes": 462,
-    "import lines, percent of code": 10.8,
-    "test lines": 31_565,
+    "functions": 3_165,
+    "classes": 470,
+    "import lines, percent of code": 11.0,
+    "test lines": 32_560,
     "pages": 18,
     "words of pages": 40_000,
-    "files entered by an estimate": 42,
+    "files entered by an estimate": 43,
     "files entered by plain Monte Carlo": 20,
-    "files entered by the command": 82,
+    "files entered by the command": 83,
     "own frames from estimate to f": 8,
     "own frames from the command to f": 16,
 }
