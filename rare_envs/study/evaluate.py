@@ -18,7 +18,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -233,8 +232,8 @@ def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
     return Repeatability(len(again), int(changed.sum()), float(apart.max(initial=0.0)), n_elsewhere)
 
 
-N_PROCESSES, N_ASKED, ASKED_EVERY = 4, 8, 10
-"""Other processes, queries of one episode that are made again in each, and ticks between them."""
+N_PROCESSES, N_ASKED, ASKED_EVERY = 2, 8, 10
+"""Other processes, one after the other, queries of one episode that are made again in each, and ticks between them."""
 ELSEWHERE_TIMEOUT = 60.0
 """How long that process may take [s]."""
 _ELSEWHERE = """
@@ -272,8 +271,8 @@ class _Recorder:
         return action, after
 
 
-def count_other_answers(study: Study, x: FloatArray) -> int:
-    """Return how many answers of an ego `module:function`, driving scenarios x, are others in other processes."""
+def count_other_answers(study: Study, x: FloatArray) -> int | None:
+    """Return how many answers of an ego `module:function`, driving scenarios x, are others in other processes; None if unknown."""
     name, driver = strip_prefixes(study.question.ego), study.problem.driver
     if study.ego_was_given or find_ego_kind(name) != "function" or not isinstance(driver, PolicyDriver):
         return 0
@@ -286,10 +285,9 @@ def count_other_answers(study: Study, x: FloatArray) -> int:
         places = [str(top.parents[top.name == "__init__.py"]), *sys.path]
         message = pickle.dumps((os.getcwd(), places, *name.split(":"), queries))
         own = np.concatenate([action.reshape(len(action), -1) for _, _, action in recorder.kept])
-        with ThreadPoolExecutor(N_PROCESSES) as threads:
-            apart = np.abs([answer - own for answer in threads.map(_ask_elsewhere, [message] * N_PROCESSES)])
-    except (Exception, EgoGone):  # it does not answer there at all: nothing is known
-        return 0
+        apart = np.abs([_ask_elsewhere(message) - own for _ in range(N_PROCESSES)])
+    except (Exception, EgoGone):  # it does not answer there at all
+        return None
     return int((apart.max(axis=(0, 2)) > ACTION_ROUNDING).sum())
 
 

@@ -119,8 +119,8 @@ class Repeatability(NamedTuple):
     """With another f."""
     largest: float
     """Largest difference of f."""
-    n_elsewhere: int = 0
-    """Answers of an ego `module:function` that are others in another process."""
+    n_elsewhere: int | None = 0
+    """Answers of an ego `module:function` that are others in another process; None where it gave none there."""
 
     @property
     def warning(self) -> str:
@@ -253,6 +253,8 @@ class Report:
             found.insert(0, f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)")
         found += [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
         found += [f"sensitivity is not known: {self.sensitivity}"] if isinstance(self.sensitivity, str) else []
+        if self.repeatability is not None and self.repeatability.n_elsewhere is None:
+            found.append("whether the ego answers alike in another process is not known: it gave no answer there")
         found += [self.lost] if self.lost else []
         left_out = "" if self.no_rate else describe_left_out(self.study, self.estimate)
         return (*found, *([f"left out of the intervals: {left_out}"] if left_out else []))

@@ -247,9 +247,11 @@ def test_an_ego_that_depends_on_its_process_is_noticed(here: Path) -> None:
         "same = Ego\n"
     )
     (here / "steady.py").write_text((here / "hashed.py").read_text().replace("os.getpid()", "9"))
-    found = {name: run(prepare(replace(QUESTION, ego=f"{name}:same"))) for name in ("hashed", "steady")}
+    (here / "single.py").write_text("open('single.lock', 'x').close()\n" + (here / "steady.py").read_text())
+    found = {name: run(prepare(replace(QUESTION, ego=f"{name}:same"))) for name in ("hashed", "steady", "single")}
     assert found["hashed"].doubtful and "in another process" in found["hashed"].warnings[-1]
-    assert "in another process" not in str(found["steady"].warnings)
+    assert "in another process" not in str((found["steady"].warnings, found["steady"].notes))
+    assert "in another process is not known" in found["single"].notes[-1]
 
 
 ASKED = Question(
