@@ -272,7 +272,7 @@ class _Recorder:
 
 
 def count_other_answers(study: Study, x: FloatArray) -> int | None:
-    """Return how many answers of an ego `module:function`, driving x, are others in other processes; None if unknown."""
+    """Return how many answers of an ego `module:function`, driving x, are others in other processes; None: unknown."""
     name, driver = strip_prefixes(study.question.ego), study.problem.driver
     if study.ego_was_given or find_ego_kind(name) != "function" or not isinstance(driver, PolicyDriver):
         return 0
