@@ -117,8 +117,8 @@ class ServerLink:
             left = deadline - time.monotonic()
             ready = dict(poller.poll(math.ceil(1000 * max(0.0, min(left, _LOOK)))))
             # ZeroMQ bounds each frame, and keeps the frames of a message until the last one is there
-            most = protocol.MAX_ANSWER_BYTES
-            demand(self._count_received() - before <= most, f"an answer of more than {most:,} bytes")
+            most, frames = protocol.MAX_ANSWER_BYTES, list[bytes]()
+            received = self._count_received() - before
             told = self._monitor in ready and (self._socket not in ready or (self._counts and self._connection is None))
             news = recv_monitor_message(self._monitor) if told else None
             if news is not None and news["event"] == zmq.EVENT_CONNECTED:
@@ -126,10 +126,13 @@ class ServerLink:
                     self._connection = socket.socket(fileno=os.dup(news["value"]))
                 before = self._count_received()
             elif self._socket in ready:
-                return protocol.open_envelope(self._socket.recv_multipart())[1]
+                frames = self._socket.recv_multipart()
             elif news is not None:
                 event = zmq.Event(news["event"])
                 raise (RemoteError if event in _HOPELESS else LinkError)(_BROKEN[event])
+            demand(max(received, sum(map(len, frames))) <= most, f"an answer of more than {most:,} bytes")
+            if frames:
+                return protocol.open_envelope(frames)[1]
             if left <= 0:
                 raise NoAnswer(f"no answer within {timeout:.3g} s")
             self._look()
