@@ -23,6 +23,15 @@ def test_above_1000_simulations_the_result_is_that_of_two_stage():
 
 
 @pytest.mark.parametrize(
+    ("dim", "max_sim", "name"), [(20, 2000, "two-stage"), (21, 2000, "adss"), (21, 2001, "two-stage")]
+)
+def test_few_simulations_in_many_dimensions_are_for_subset_simulation(dim, max_sim, name):
+    result = samplers.estimate(half_space(dim, 3.0).problem, seed=0, max_sim=max_sim)
+    assert result.choice == f"{name}: {max_sim:,} simulations for {dim} dimensions"
+    assert result.interval[0] < norm.sf(3.0) < result.interval[1]
+
+
+@pytest.mark.parametrize(
     ("seconds", "max_sim", "name"), [(None, 1000, "surrogate"), (1.0, None, "surrogate"), (None, None, "two-stage")]
 )
 def test_noise_does_not_count_as_dimensions_and_slow_simulations_are_few(seconds, max_sim, name):

@@ -9,6 +9,7 @@ from scipy import stats
 import samplers
 from benchmarks.samplers.problems import PROBLEMS
 from samplers.limit_states import Reference, four_branches, half_space, plateau, shell
+from samplers.methods.two_stage.regions import Discovery
 from samplers.problem import FunctionProblem
 
 TS = samplers.TwoStage
@@ -140,6 +141,14 @@ def test_subset_simulation_takes_over(recorder):
     assert result.interval[0] < reference.p < result.interval[1]
     assert 0.15 < result.cov < 1
     assert result.n_sim <= 6000
+
+
+def test_the_more_regions_are_met_the_more_may_be_unseen():
+    """12 searches that led to K regions are worth 24 / (1 + K) to each; 97.5 % points of Beta(1/10, nu)."""
+    for regions, worth in ((1, 12.0), (2, 8.0), (5, 4.0)):
+        found = Discovery(searches=12.0, regions=regions)
+        assert found.lineages == worth
+        assert found.unseen_share(0.95) == pytest.approx(stats.beta(0.1, worth).ppf(0.975))
 
 
 @pytest.mark.parametrize("max_sim", [800, 1500])
