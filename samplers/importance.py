@@ -208,7 +208,8 @@ def weighted_interval(
 ) -> Interval:
     """Return the interval of p: log-normal, with t quantiles for few draws; Clopper-Pearson's for plain ones.
 
-    Below LOW_ESS its upper end is at least `bernstein_bound`, or `ceiling` where that is less; without a failing draw
+    Below LOW_ESS its upper end is at least `bernstein_bound`, or `ceiling` where that is less, and its lower end
+    that without the heaviest draw, where it lies above p without this. Without a failing draw
     p <= largest_weight P_q[failure].
     """
     hits = len(draws.f)
@@ -219,6 +220,11 @@ def weighted_interval(
     low, high = log_normal_interval(draws.p, spread, confidence, degrees_of_freedom(draws.ess, independent=True))
     if draws.ess < LOW_ESS:
         high = max(high, min(bernstein_bound(draws, confidence, largest_weight), ceiling))
+        others = np.sort(draws.log_weights)[:-1]
+        df = degrees_of_freedom(effective_sample_size(others), independent=True)
+        p = float(np.exp(others).sum()) / draws.n
+        if low > p:  # it rests on one draw
+            low = log_normal_interval(p, weighted_cov(draws.n, others), confidence, df)[0]
     return low, high
 
 

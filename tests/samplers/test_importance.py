@@ -85,6 +85,12 @@ def test_bernstein_bound_is_that_of_the_theorem():
     assert bernstein_bound(weighing(0.5, 2.0, 4.0, n=n), 0.9, 1e4) == 1.0
 
 
+def test_one_heavy_draw_does_not_lift_the_lower_end_above_what_the_others_say():
+    """100 failures of weight 0.01 among 1,000 draws say 0.001, whatever one more weighs: here p-hat is 0.051."""
+    low, high = weighted_interval(weighing(*[0.01] * 100, 50.0), 0.95, 50.0)
+    assert 0.0005 < low < 0.001 < 0.051 < high
+
+
 def test_doubts_are_of_few_and_of_heavy_draws():
     assert "draws: 9;" in weight_warnings(equal(9))[0]
     assert weight_warnings(equal(10)) == []
