@@ -1,18 +1,25 @@
-"""Everything public has an example, and the examples print what they show."""
+"""Everything public has an example, the examples print what they show, and all texts use the words of the field."""
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
 
 import pytest
+import yaml
 
 from rare_envs.startup import use_one_thread
 
 PACKAGES = ("samplers", "rare_envs", "agents", "training")
+ROOT = Path(__file__).parents[1]
+WORDS = yaml.safe_load((ROOT / "tests/words.yaml").read_text())
 
 
 def packages_in(name: str) -> Iterator[str]:
@@ -62,3 +69,49 @@ def test_examples_of_a_public_name(name: str) -> None:
 
 def test_names_without_an_example_are_public() -> None:
     assert set(WITHOUT_EXAMPLE) <= set(PUBLIC)
+
+
+def messages_in(path: Path) -> Iterator[str]:
+    """Yield the texts of three words or more in a module, but for docstrings: messages, help texts, labels."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    parts = {id(part) for node in nodes if isinstance(node, ast.JoinedStr | ast.Expr) for part in ast.walk(node)}
+    for node in nodes:
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts:
+            yield node.value
+
+
+def texts_of_users() -> Iterator[tuple[str, str]]:
+    """Yield a place and a text of each paragraph, message and public docstring."""
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        yield from ((str(path.relative_to(ROOT)), text) for text in path.read_text(encoding="utf-8").split("\n\n"))
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            yield from ((str(path.relative_to(ROOT)), text) for text in messages_in(path) if len(text.split()) > 2)
+    for name, value in PUBLIC.items():
+        members = vars(value) if inspect.isclass(value) else {}
+        for each in (value, *(member for key, member in members.items() if not key.startswith("_"))):
+            yield from ((name, text) for text in (inspect.getdoc(each) or "").split("\n\n"))
+
+
+def words_to_avoid(place: str, text: str) -> Iterator[str]:
+    """Yield what a text says in words of `WORDS`, and what to write in their place."""
+    for pattern, better in [*WORDS["everywhere"], *([] if is_one_of(place, "probability") else WORDS["driving"])]:
+        if not any(fnmatch(place, known) and allowed in pattern for known, allowed, _ in WORDS["allowed"]):
+            for found in re.finditer(pattern, " ".join(text.split())):
+                yield f"{place}: {found[0]!r} -> {better}"
+
+
+def is_one_of(place: str, kind: str) -> bool:
+    return any(fnmatch(place, known) for known in WORDS[kind])
+
+
+def test_texts_use_the_words_of_the_field() -> None:
+    mended = (each for each in texts_of_users() if not is_one_of(each[0], "until_mended"))
+    assert not [found for place, text in mended for found in words_to_avoid(place, text)]
+
+
+def test_words_to_avoid_are_found() -> None:
+    assert list(words_to_avoid("docs/a.md", "Where nothing fails, p holds\nthe true value in brackets; c.o.v. 0.1."))
+    assert not list(words_to_avoid("samplers/a.py", "If nothing fails, the interval covers p; c.o.v. 0.1."))
