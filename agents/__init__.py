@@ -21,3 +21,8 @@ __all__ = [
     "read_provenance",
     "save_driver",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the public names, used already or not."""
+    return __all__

@@ -17,7 +17,6 @@ if not is_command_line() or not find_missing_libraries():  # a command line show
         env,
         make_batch,
         parallel_env,
-        raw_env,
         register_envs,
         register_scenario,
     )
@@ -26,9 +25,8 @@ if not is_command_line() or not find_missing_libraries():  # a command line show
 
 if TYPE_CHECKING:
     from rare_envs.control.idm import IDM
-    from rare_envs.distributions.mixture import TruncatedGaussianMixture
     from rare_envs.distributions.space import ScenarioSpace
-    from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
+    from rare_envs.interop import HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
     from rare_envs.study.risk import risk
     from rare_envs.study.run_folder import load_study
@@ -40,26 +38,21 @@ __all__ = [
     "ENV_IDS",
     "IDM",
     "DrivingProblem",
-    "HighwayEnvProblem",
     "HighwayEnvScenario",
     "ScenarioSpace",
-    "TruncatedGaussianMixture",
     "env",
     "highway_env_problem",
     "load_study",
     "make_batch",
     "parallel_env",
-    "raw_env",
     "register_scenario",
     "risk",
 ]
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
     "IDM": "rare_envs.control.idm",
-    "HighwayEnvProblem": "rare_envs.interop",
     "HighwayEnvScenario": "rare_envs.interop",
     "ScenarioSpace": "rare_envs.distributions.space",
-    "TruncatedGaussianMixture": "rare_envs.distributions.mixture",
     "highway_env_problem": "rare_envs.interop",
     "load_study": "rare_envs.study.run_folder",
     "risk": "rare_envs.study.risk",
@@ -71,3 +64,8 @@ _import_lazily = make_lazy_getattr(__name__, _LAZY)
 def __getattr__(name: str) -> Any:
     """Import torch only when a name that needs it is used; list the environments as they are now."""
     return tuple(SCENARIOS) if name == "ENV_IDS" else _import_lazily(name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, used already or not."""
+    return __all__

@@ -58,12 +58,14 @@ def import_object(spec: str, purpose: str) -> Any:
 
 
 def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package that imports its names on first use, each from the module that has it."""
+    """Return the `__getattr__` of a package that imports its names, from the module that has each, and its modules."""
 
     def get(name: str) -> Any:
-        if name not in modules:
+        if name in modules:
+            return getattr(importlib.import_module(modules[name]), name)  # of a module of ours
+        if name.startswith("_") or PathFinder.find_spec(f"{package}.{name}", sys.modules[package].__path__) is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(modules[name]), name)  # of a module of ours
+        return importlib.import_module(f"{package}.{name}")
 
     return get
 

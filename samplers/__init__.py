@@ -1,23 +1,25 @@
-"""Estimating the probability of rare failures: P[f(X) <= gamma].
+"""How rare is a failure? P[f(X) <= gamma] for any function f of random inputs X, with an interval and the failures.
 
-It needs NumPy and SciPy, and nothing about driving. Begin with `estimate`.
+Begin with `estimate`. It needs NumPy and SciPy, and nothing about driving. What most users need is here; the rest is in
+
+- `samplers.distributions`: distributions of X, whole or in blocks.
+- `samplers.strata`: sums over strata, P = sum_k w_k P_k.
+- `samplers.executors`: where f is called, from this process to a cluster.
+- `samplers.analysis` and `samplers.comparison`: what a result is made of, and what it answers without new simulations.
+- `samplers.run`: a run whose simulations are made elsewhere (ask and tell).
+- `samplers.methods`, `samplers.problem`, `samplers.proposals`, `samplers.sample`: parts for methods of your own.
+- `samplers.testing` and `samplers.limit_states`: checks of a method, and problems with a known answer.
 """
 
-from samplers.analysis.base_error import BaseUncertainty
+import importlib
+from typing import Any
+
 from samplers.analysis.curve import Curve
-from samplers.analysis.gate import Pilot, PlannedRun, Verdict, plan_runs
-from samplers.analysis.reweight import FittedBase, Reweighted
-from samplers.analysis.sensitivity import Sensitivity
-from samplers.analysis.weighted import Share
-from samplers.comparison import Comparison, compare
-from samplers.distributions import as_distribution
+from samplers.analysis.gate import plan
+from samplers.bases import as_distribution
+from samplers.comparison import compare
 from samplers.estimation import EstimationInterrupted, estimate
-from samplers.evaluate import Executor
-from samplers.executors import FuturesPool, InProcess, LocalProcesses, RayCluster
-from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps
-from samplers.methods import METHODS, Auto, get_method
-from samplers.methods.base import Method
-from samplers.methods.blocks import BetaBlock, GaussianBlock, MixtureBlock, NormalBlock, Product
+from samplers.methods import Auto
 from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
@@ -26,82 +28,45 @@ from samplers.methods.series.method import Series
 from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate import Surrogate
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import (
-    Distribution,
-    EvaluationError,
-    FunctionProblem,
-    Problem,
-    StandardNormal,
-    TermGradients,
-    Terms,
-)
+from samplers.problem import EvaluationError, FunctionProblem, Problem
 from samplers.result import Estimate
-from samplers.run import Progress, Run, RunArguments
-from samplers.sample import Failures, Level, Sample, Status
-from samplers.stratified_problem import StratifiedProblem, Stratum
-from samplers.workers import ExecutorError
+from samplers.sample import Failures, Status
 
 __all__ = [
-    "METHODS",
     "AdaptiveSubsetSimulation",
     "Auto",
-    "BaseUncertainty",
-    "BetaBlock",
-    "Comparison",
     "CrossEntropy",
     "Curve",
-    "Distribution",
     "Estimate",
     "EstimationInterrupted",
     "EvaluationError",
-    "Executor",
-    "ExecutorError",
     "Failures",
-    "FittedBase",
     "FunctionProblem",
-    "FuturesPool",
-    "GaussianBlock",
-    "Goal",
     "ImportanceSampling",
     "ImprovedCrossEntropy",
-    "InProcess",
-    "Interrupted",
-    "Level",
-    "LocalProcesses",
-    "Method",
-    "MixtureBlock",
     "MonteCarlo",
-    "NormalBlock",
-    "Outcome",
-    "Part",
-    "Pilot",
-    "PlannedRun",
     "Problem",
-    "Product",
-    "Progress",
-    "RayCluster",
-    "Reweighted",
-    "Run",
-    "RunArguments",
-    "Sample",
-    "Sensitivity",
     "Series",
-    "Share",
-    "StandardNormal",
     "Status",
-    "Stepping",
-    "Steps",
-    "StratifiedProblem",
-    "Stratum",
     "SubsetSimulation",
     "Surrogate",
-    "TermGradients",
-    "Terms",
     "TwoStage",
-    "Verdict",
     "as_distribution",
     "compare",
     "estimate",
-    "get_method",
-    "plan_runs",
+    "plan",
 ]
+_ON_USE = ("limit_states", "strata", "testing")
+"""Public modules that nothing above imports."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public module on first use."""
+    if name not in _ON_USE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return importlib.import_module(f"{__name__}.{name}")
+
+
+def __dir__() -> list[str]:
+    """Return the names for most users."""
+    return __all__

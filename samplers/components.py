@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, ive, log_ndtr, logsumexp, ndtri_exp
 
-from samplers.distributions import LOG_TWO_PI
+from samplers.bases import LOG_TWO_PI
 from samplers.problem import FloatArray
 
 ROWS_FROM = 8

@@ -1,416 +1,436 @@
-"""Base distributions: products, Gaussians, those of SciPy and OpenTURNS; whether the parts of one fit together."""
+"""Blocks of coordinates, each with the family that cross-entropy searches, the projections on it, and their product.
 
-from __future__ import annotations
+Equation 2 of O'Kelly et al. (2018) separates by block: the Kullback-Leibler projection of a distribution on a product
+of families is the product of the projections of its marginals. The projection of P on an exponential family with
+sufficient statistic Gamma and log partition function A maximises theta' E_P[Gamma] - A(theta).
+
+References:
+    O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing
+    via rare-event simulation", NeurIPS 2018.
+"""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import chdtri, gammaincinv, ndtr, ndtri, stdtrit
+from scipy.optimize import minimize
+from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
-FloatArray = NDArray[np.float64]
-LOG_TWO_PI = float(np.log(2 * np.pi))
+from samplers.bases import Gaussian, IndependentDistributions, as_distribution
+from samplers.components import expectation_maximisation, one_hot, posterior
+from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, needs_library
+from samplers.proposals import Mixture, move_gaussian
 
-
-class DrawnByItsMap:
-    """A distribution of `dim` coordinates that is drawn from by its map from standard normal space, by `rng` alone."""
-
-    dim: Any
-    from_standard_normal: Any
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, (n, d)."""
-        return np.asarray(self.from_standard_normal(rng.standard_normal((n, self.dim))))
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} in {self.dim} dimensions>"
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class IndependentDistributions(DrawnByItsMap):
-    """The product of distributions, each of some consecutive coordinates."""
-
-    blocks: tuple[Any, ...]
-
-    @cached_property
-    def dim(self) -> int:
-        """Number of coordinates d."""
-        return sum(block.dim for block in self.blocks)
-
-    def split(self, x: FloatArray) -> Iterator[tuple[Any, FloatArray]]:
-        """Return each block with its columns of x (n, d)."""
-        ends = np.cumsum([block.dim for block in self.blocks])[:-1]
-        return zip(self.blocks, np.split(x, ends, axis=1), strict=True)
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, (n, d)."""
-        return np.hstack([block.sample(n, rng) for block in self.blocks])
-
-    def log_probs(self, x: FloatArray, /) -> FloatArray:
-        """Return the log density of each block at x (n, d), (blocks, n)."""
-        return np.stack([block.log_prob(part) for block, part in self.split(x)])
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Return the log density (n,) at x (n, d)."""
-        return np.asarray(self.log_probs(x).sum(axis=0))
-
-    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x (n, d) to u ~ N(0, I)."""
-        return np.hstack([block.to_standard_normal(part) for block, part in self.split(x)])
-
-    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Map u ~ N(0, I), (n, d), to x."""
-        return np.hstack([block.from_standard_normal(part) for block, part in self.split(u)])
+__all__ = [
+    "BetaBlock",
+    "Distribution",
+    "GaussianBlock",
+    "MixtureBlock",
+    "NormalBlock",
+    "Product",
+    "StandardNormal",
+    "as_distribution",
+]
 
 
-@dataclass(frozen=True, eq=False)
-class Gaussian(DrawnByItsMap):
-    """N(mean, L L') with a mean (d,) and lower triangular L (d, d)."""
-
-    mean: FloatArray
-    cholesky: FloatArray
-
-    @classmethod
-    def standard(cls, dim: int) -> Gaussian:
-        """Return N(0, I)."""
-        return cls(np.zeros(dim), np.eye(dim))
-
-    @classmethod
-    def from_covariance(cls, mean: FloatArray, covariance: FloatArray) -> Gaussian:
-        """Return N(mean, covariance) from a mean (d,) and a positive definite covariance (d, d)."""
-        return cls(mean, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates d."""
-        return len(self.mean)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """L L', shape (d, d)."""
-        return self.cholesky @ self.cholesky.T
-
-    def widen(self, factor: float) -> Gaussian:
-        """Return the same with all standard deviations multiplied by factor."""
-        return Gaussian(self.mean, factor * self.cholesky)
-
-    def log_prob(self, u: FloatArray) -> FloatArray:
-        """Return the log density at u (n, d), shape (n,)."""
-        z = self.to_standard_normal(u)
-        log_det = float(np.log(np.diag(self.cholesky)).sum())
-        return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - log_det - 0.5 * self.dim * LOG_TWO_PI)
-
-    def to_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Return L^-1 (u - mean) of the rows of u (n, d)."""
-        return np.asarray(solve_triangular(self.cholesky, (u - self.mean).T, lower=True).T)
-
-    def from_standard_normal(self, z: FloatArray) -> FloatArray:
-        """Return mean + L z of the rows of z (n, d)."""
-        return np.asarray(self.mean + z @ self.cholesky.T)
+def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
+    """Return E[log y] and E[log(1 - y)] for y ~ Beta(alpha, beta), each (m,), as (m, 2): the gradient of log B."""
+    together = digamma(alpha + beta)
+    return np.stack([digamma(alpha) - together, digamma(beta) - together], axis=-1)
 
 
-def gaussian_of_scipy(frozen: Any) -> Gaussian:
-    """Return a frozen `scipy.stats.multivariate_normal`; a ValueError if its covariance is singular."""
-    mean = np.atleast_1d(np.asarray(frozen.mean, dtype=np.float64))
-    rank = int(frozen.cov_object.rank)
-    if rank < len(mean):
-        raise ValueError(
-            f"Expected a multivariate_normal with a covariance of rank {len(mean)}, got rank {rank}: some "
-            "coordinates follow from others; leave these out."
-        )
-    return Gaussian.from_covariance(mean, np.atleast_2d(frozen.cov_object.covariance))
+def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
+    """Return alpha, beta (m, 2) in [low, high] that maximise (alpha, beta) . statistics - log B, row by row."""
+
+    def loss(parameters: FloatArray) -> tuple[float, FloatArray]:
+        theta = parameters.reshape(statistics.shape)
+        alpha, beta = theta.T
+        slope = beta_statistics(alpha, beta) - statistics
+        return float((betaln(alpha, beta) - (theta * statistics).sum(axis=1)).sum()), slope.ravel()
+
+    start = np.full(statistics.size, np.clip(2.0, low, high))
+    options: Any = {"maxiter": 1000, "ftol": 1e-15, "gtol": 1e-10}
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(start), options=options)
+    return np.asarray(found.x.reshape(statistics.shape))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ScipyDistribution(DrawnByItsMap):
-    """Independent coordinates with a continuous distribution of `scipy.stats`, k of them for parameters (k,).
+def project_mean(target: FloatArray, centre: FloatArray, cholesky: FloatArray, radius: float) -> FloatArray:
+    """Return mu (d,) with |mu - centre|_inf <= radius and the least |L^-1 (mu - target)|, L = cholesky (d, d).
 
-    It is a frozen one, or of those with methods `icdf` and `ccdf`, as `scipy.stats.Normal`.
+    A quadratic programme, solved by OSQP through cvxpy, unless the target is in the box or L diagonal.
     """
-
-    frozen: Any
-
-    def __post_init__(self) -> None:
-        """Raise a ValueError for a discrete distribution and for invalid parameters."""
-        dist = getattr(self.frozen, "dist", self.frozen)
-        name = getattr(dist, "name", type(dist).__name__)
-        if {"rv_discrete", "DiscreteDistribution"} & {kind.__name__ for kind in type(dist).__mro__}:
-            raise ValueError(f"Expected a continuous distribution, got the discrete {name} of scipy.stats.")
-        if np.ndim(self._median) > 1 or not np.isfinite(self._median).all():
-            given = repr(dist) if dist is self.frozen else f"{self.frozen.args} and {self.frozen.kwds}"
-            given = " ".join(given.split())
-            raise ValueError(f"Expected valid parameters of {name}, of shape () or (k,), got {given}.")
-
-    def _call(self, name: str, values: Any) -> FloatArray:
-        """Call ppf, isf or sf by the name that it has."""
-        own = name if hasattr(self.frozen, "ppf") else {"ppf": "icdf", "isf": "iccdf", "sf": "ccdf"}[name]
-        return np.asarray(getattr(self.frozen, own)(values), dtype=np.float64)
-
-    @cached_property
-    def _median(self) -> FloatArray:
-        return self._call("ppf", 0.5)
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates k."""
-        return int(self._median.size)
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Return the log density (n,) at x (n, k)."""
-        return np.asarray(self.frozen.logpdf(x).sum(axis=1))
-
-    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x (n, k) to u ~ N(0, I)."""
-        return np.asarray(np.where(x > self._median, -ndtri(self._call("sf", x)), ndtri(self.frozen.cdf(x))))
-
-    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Map u ~ N(0, I), (n, k), to x."""
-        tail = ndtr(-np.abs(u))
-        return np.asarray(np.where(u > 0, self._call("isf", tail), self._call("ppf", tail)))
+    clipped = np.clip(target, centre - radius, centre + radius)
+    diagonal = np.count_nonzero(cholesky) == len(centre)
+    if diagonal or radius == 0 or (clipped == target).all():
+        return clipped
+    with needs_library("cvxpy", "A bounded step of a mean whose coordinates are correlated"):
+        cp: Any = import_module("cvxpy")  # over a second to import; its functions are not typed
+    inverse = solve_triangular(cholesky, np.eye(len(target)), lower=True)
+    inverse /= np.abs(inverse).max()  # so that the solver's absolute tolerances do not depend on units
+    z = cp.Variable(len(target))
+    distance = cp.sum_squares(inverse @ z - inverse @ ((target - centre) / radius))
+    programme = cp.Problem(cp.Minimize(distance), [z >= -1, z <= 1])
+    programme.solve(solver=cp.OSQP, max_iter=100_000)
+    if z.value is None:
+        raise RuntimeError(
+            f"The projection on the box of the mean was not solved ({programme.status}): its covariance may be close "
+            "to singular; take a wider box."
+        )
+    return centre + radius * np.clip(np.asarray(z.value, dtype=np.float64), -1.0, 1.0)
 
 
-FARTHEST_U = 7.0
-"""Largest |u| where a distribution has no points farther out in OpenTURNS: P[U > 7] = 1.3e-12, below what is estimated.
-From 8 on, where 1 - P[U > u] is nearly 1 in double precision, the quantile of a Student distribution is infinite and
-that of a Gumbel copula is not a number."""
-TRIED_U = np.array([9.0, 12.0, 20.0, 30.0])
-"""|u| at which it is tried whether points have a place farther out."""
-CHECKED_POINTS = 12
-"""Points at which the transformation is compared with the density."""
-CHECKED_DIMS = 50
-"""Dimensions up to which it is compared: the comparison takes 24 points for each."""
-CHECK_STEP = 1e-3
-"""Step in u of the finite differences of the comparison."""
-LARGEST_ERROR = 0.02
-"""Error of the density by the transformation, as a difference of logarithms, at half of the points."""
+PAPERS_BOX = (1.5, 7.0)
+"""Range of alpha and beta in O'Kelly et al. 2018; their released code has [0.5, 5]."""
+SMALLEST = float(np.finfo(np.float64).tiny)
+"""Stands for 0 where the logarithm is taken."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class OpenTurnsDistribution(DrawnByItsMap):
-    """A continuous distribution or copula of OpenTURNS; refused where its transformation does not lead to N(0, I)."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BetaBlock:
+    """Independent coordinates low + (high - low) Beta(alpha, beta), the parameters in a box.
 
-    distribution: Any
-
-    def __post_init__(self) -> None:
-        """Raise a ValueError for a distribution that is not continuous or whose transformation is of no use."""
-        name = type(self.distribution).__name__
-        if not self.distribution.isContinuous():
-            raise ValueError(f"Expected a continuous distribution, got {name} of OpenTURNS, which is not.")
-        standard = self.distribution.getStandardDistribution()
-        inside = getattr(standard, "getImplementation", None)  # some come in an interface object
-        leads_to = str((standard if inside is None else inside()).getClassName())
-        if leads_to != "Normal" and self.dim > 1:
-            raise ValueError(
-                f"The iso-probabilistic transformation of this {name} leads to {leads_to}, not to N(0, I): "
-                "use another copula, such as openturns.NormalCopula."
-            )
-        error = self._density_error() if self.dim <= CHECKED_DIMS else 0.0
-        if error > LARGEST_ERROR:
-            raise ValueError(
-                f"OpenTURNS' iso-probabilistic transformation of this {name} does not have its density (off by "
-                f"{100 * math.expm1(error):.0f} %), so that p would be wrong: give an object with sample, log_prob, "
-                "to_standard_normal and from_standard_normal instead."
-            )
-
-    def _density_error(self) -> float:
-        """Return the median of |log p(x) - log phi(u) + log |det dx/du|| over some points."""
-        u = np.random.default_rng(0).standard_normal((CHECKED_POINTS, self.dim))
-        steps = CHECK_STEP * np.eye(self.dim)
-        ahead, behind = (self.from_standard_normal((u[:, None] + s * steps).reshape(-1, self.dim)) for s in (1, -1))
-        slopes = ((ahead - behind) / (2 * CHECK_STEP)).reshape(CHECKED_POINTS, self.dim, self.dim)
-        volume = np.linalg.slogdet(slopes).logabsdet
-        log_phi = -0.5 * (u**2).sum(axis=1) - 0.5 * self.dim * LOG_TWO_PI
-        return float(np.median(np.abs(self.log_prob(self.from_standard_normal(u)) - log_phi + volume)))
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates d."""
-        return int(self.distribution.getDimension())
-
-    @property
-    def column_names(self) -> tuple[str, ...]:
-        """The description of the distribution; empty where it is OpenTURNS' own, X0, X1, ..., or has a name twice."""
-        names = tuple(self.distribution.getDescription())
-        given = any(name != f"X{i}" for i, name in enumerate(names))
-        return names if given and len(set(names)) == self.dim else ()
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Return the log density (n,) at x (n, d)."""
-        log_p = np.asarray(self.distribution.computeLogPDF(x), dtype=np.float64).reshape(len(x))
-        return np.where(log_p <= np.finfo(np.float64).min, -np.inf, log_p)  # its logarithm of 0
-
-    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x (n, d) to u ~ N(0, I)."""
-        if self.dim > 1 or len(x) == 0:
-            return _map(self.distribution.getIsoProbabilisticTransformation(), x)
-        above = np.asarray(self.distribution.computeComplementaryCDF(x))
-        return np.where(above < 0.5, -ndtri(above), ndtri(np.asarray(self.distribution.computeCDF(x))))
-
-    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Map u ~ N(0, I), (n, d), to x; |u| is cut at `FARTHEST_U` where OpenTURNS finds no points beyond it."""
-        return self._find_x(np.clip(u, -FARTHEST_U, FARTHEST_U) if self._is_cut else u)
-
-    @cached_property
-    def _is_cut(self) -> bool:
-        """Whether points far out have no place, so that u is cut for all points alike, whatever their batch."""
-        try:
-            ends = [self._find_x(far * np.repeat(TRIED_U[:, None], self.dim, axis=1)) for far in (-1.0, 1.0)]
-        except (TypeError, ValueError, RuntimeError):  # the errors of OpenTURNS
-            return True
-        return not np.isfinite(ends).all()
-
-    def _find_x(self, u: FloatArray) -> FloatArray:
-        """Return the points that OpenTURNS finds for u (n, d); some lie at infinity."""
-        if self.dim > 1:
-            return _map(self.distribution.getInverseIsoProbabilisticTransformation(), u)
-        tail = ndtr(-np.abs(u[:, 0]))
-        low, high = (np.asarray(self.distribution.computeQuantile(tail, upper)) for upper in (False, True))
-        return np.where(u > 0, high, low)
-
-
-def _map(transformation: Any, points: FloatArray) -> FloatArray:
-    """Return what a transformation of OpenTURNS makes of points (n, d)."""
-    points = np.asarray(points, dtype=np.float64)
-    return np.asarray(transformation(points), dtype=np.float64) if len(points) else points.copy()
-
-
-METHODS_OF_A_BASE = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
-
-
-def as_distribution(base: Any, dim: int | None = None) -> Any:
-    """Return a base distribution (`samplers.Distribution`) for one of SciPy or OpenTURNS, or for a list of them.
+    Sufficient statistics log y and log(1 - y) of y = (x - low) / (high - low).
 
     Args:
-        base: A distribution of `scipy.stats` with its parameters (one coordinate, or k with parameters of shape (k,)),
-            its `multivariate_normal`, a distribution or copula of OpenTURNS, or a list of these, one behind the other
-            and independent. What is a base distribution already is returned as it is.
-        dim: Number of dimensions wanted: a distribution of one coordinate is then repeated. None takes what base has.
+        alpha: First parameter, positive; a number or shape (b,), as all four.
+        beta: Second parameter.
+        low: Lower end of the support.
+        high: Upper end.
+        box: Bounds of both parameters throughout the family.
 
     Raises:
-        ValueError: If base is none of these, is not continuous, or has another number of dimensions.
+        ValueError: If a parameter is not in the box, the box not in (0, inf) or low not < high.
 
     Example:
         >>> import numpy as np
-        >>> from scipy import stats
-        >>> base = as_distribution([stats.lognorm(0.5), stats.multivariate_normal([1.0, 2.0])])
-        >>> base.from_standard_normal(np.zeros((1, 3)))
-        array([[1., 1., 2.]])
-        >>> as_distribution(stats.poisson(3.0))
-        Traceback (most recent call last):
-            ...
-        ValueError: Expected a continuous distribution, got the discrete poisson of scipy.stats.
+        >>> gap = BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=40.0)  # [m]
+        >>> gap.from_standard_normal(np.array([[0.0]]))
+        array([[20.]])
+        >>> near = gap.project(np.array([[2.0], [4.0]]), np.array([0.5, 0.5]), alpha=0.8)
+        >>> near.alpha.round(2), near.beta.round(2)  # towards small gaps
+        (array([1.5]), array([6.31]))
     """
-    found = convert(base)
-    if found is None and isinstance(base, list | tuple) and base:
-        found = IndependentDistributions(tuple(as_distribution(part) for part in base))
-    if found is None:
-        # of a user's class
-        if isinstance(base, type) or not all(callable(getattr(base, name, None)) for name in METHODS_OF_A_BASE):
-            unfrozen = isinstance(base, type) or type(base).__name__.endswith("_gen")  # those of SciPy
-            hint = ": call it, with its parameters" if unfrozen else ""
+
+    alpha: FloatArray
+    beta: FloatArray
+    low: FloatArray
+    high: FloatArray
+    box: tuple[float, float] = PAPERS_BOX
+
+    def __post_init__(self) -> None:
+        """Bring the parameters to one shape and check them."""
+        names = ("alpha", "beta", "low", "high")
+        # fields by name
+        arrays = np.broadcast_arrays(*(np.atleast_1d(np.asarray(getattr(self, n), np.float64)) for n in names))
+        parameters = dict(zip(names, arrays, strict=True))
+        for name, array in parameters.items():
+            object.__setattr__(self, name, array)
+        least, most = self.box
+        inside = all(((array >= least) & (array <= most)).all() for array in arrays[:2])
+        if not (0 < least < most < math.inf and inside and (self.low < self.high).all() and self.low.ndim == 1):
             raise ValueError(
-                f"Expected a distribution of scipy.stats with its parameters, such as norm(0, 1), one of OpenTURNS, a "
-                f"list of them, or an object with {', '.join(METHODS_OF_A_BASE)}; got {base!r}{hint}."
+                f"BetaBlock: expected alpha and beta in the box [{least}, {most}] with positive bounds and "
+                f"low < high, all of shape (b,), got {', '.join(f'{n} {a}' for n, a in parameters.items())}."
             )
-        found = base
-    own = getattr(found, "dim", None)  # a user's distribution need not have it
-    if dim is None or own is None or own == dim:
-        return found
-    if own == 1:
-        return IndependentDistributions((found,) * dim)
-    raise ValueError(f"Expected a base distribution of {dim} dimensions, got {own}.")
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates b."""
+        return len(self.alpha)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, b)."""
+        return self._to_interval(rng.beta(self.alpha, self.beta, size=(n, self.dim)))
+
+    def log_prob(self, x: FloatArray, /) -> FloatArray:
+        """Log density at x (n, b), shape (n,); -inf outside the support."""
+        inside = ((x >= self.low) & (x <= self.high)).all(axis=1)
+        log_y, log_rest = self._logs(x)
+        logs = (self.alpha - 1) * log_y + (self.beta - 1) * log_rest
+        constant = betaln(self.alpha, self.beta) + np.log(self.high - self.low)
+        return np.where(inside, (logs - constant).sum(axis=1), -np.inf)
+
+    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
+        """Return Phi^-1 of the distribution function of each coordinate, by the nearer tail."""
+        y = (x - self.low) / (self.high - self.low)
+        below, above = betainc(self.alpha, self.beta, y), betaincc(self.alpha, self.beta, y)
+        return np.where(below < above, ndtri(below), -ndtri(above))
+
+    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
+        """Inverse of `to_standard_normal`."""
+        y = np.where(u < 0, betaincinv(self.alpha, self.beta, ndtr(u)), betainccinv(self.alpha, self.beta, ndtr(-u)))
+        return self._to_interval(y)
+
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "BetaBlock":
+        """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_beta`."""
+        elite = np.stack([weights @ logs for logs in self._logs(x)], axis=-1)
+        target = alpha * elite + (1 - alpha) * beta_statistics(self.alpha, self.beta)
+        parameters = project_beta(target, *self.box)
+        return replace(self, alpha=parameters[:, 0], beta=parameters[:, 1])
+
+    def widen(self, factor: float) -> "BetaBlock":
+        """Return the same means with `factor` times the standard deviations, as far as the box allows."""
+        total = self.alpha + self.beta  # the variance is mean (1 - mean) / (total + 1)
+        shrink = np.maximum((total + 1) / factor**2 - 1, 0.0) / total
+        return replace(self, alpha=np.clip(shrink * self.alpha, *self.box), beta=np.clip(shrink * self.beta, *self.box))
+
+    def _to_interval(self, y: FloatArray) -> FloatArray:
+        """Return low + (high - low) y, one float inside the support, where the statistics are finite."""
+        x = self.low + (self.high - self.low) * y
+        return np.clip(x, np.nextafter(self.low, self.high), np.nextafter(self.high, self.low))
+
+    def _logs(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return log y and log(1 - y) of x (n, b), shape (n, b) each."""
+        y, rest = (x - self.low) / (self.high - self.low), (self.high - x) / (self.high - self.low)
+        return np.log(np.maximum(y, SMALLEST)), np.log(np.maximum(rest, SMALLEST))
 
 
-def convert(base: Any) -> Any:
-    """Return a distribution of SciPy (discrete ones are refused) or OpenTURNS as a base; None for anything else."""
-    library = type(base).__module__
-    if hasattr(base, "freeze") and getattr(base, "numargs", None) == 0:  # of no shape parameters, as a histogram
-        base = base.freeze()
-    if library.startswith("scipy.stats") and hasattr(base, "cov_object"):
-        return gaussian_of_scipy(base)
-    frozen = hasattr(base, "ppf") and getattr(base, "dist", None) is not None
-    if frozen or (all(hasattr(base, name) for name in ("icdf", "iccdf", "logpdf")) and not isinstance(base, type)):
-        return ScipyDistribution(base)
-    known = library.startswith("openturns") and hasattr(base, "getIsoProbabilisticTransformation")
-    return OpenTurnsDistribution(base) if known else None
+EM_STEPS = 10
+"""M-steps per step of cross-entropy, always all of them; each one raises the objective."""
+KMEANS_RESTARTS = 3
+"""Starts of k-means, of which the best is taken: one alone may put two centres into one region."""
+EMPTY = float(np.finfo(np.float64).eps)
+"""A component with less weight has no points left."""
 
 
-N_DRAWS = 200
-"""Draws of a base distribution that are looked at, to see whether its parts fit together."""
-FALSE_ALARM = 1e-6
-"""Largest probability that a base whose parts fit is refused."""
-ROUND_TRIP = 1e-3
-"""Largest error of x -> u -> x, as a share of the standard deviation of a coordinate: numerical inverses, float32."""
-MAX_CORRELATED = 1000
-"""Coordinates up to which every pair is looked at; of more, the pairs within blocks of so many."""
+def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatArray, alpha: float) -> Mixture:
+    """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than P, the present one.
 
-
-def find_base_fault(base: Any, dim: int, n: int = N_DRAWS) -> str | None:
-    """Return what does not fit together in a base distribution of d coordinates, in words; None if nothing is seen.
-
-    If its map is not implemented, which plain Monte Carlo does not need, only n draws and their density are looked at.
+    Q has the points x (n, d) with weights (n,), shared anew in every step; the mass of P stays with its components.
+    One component becomes k copies, and the points are first shared by k-means.
     """
-    x = np.asarray(base.sample(n, np.random.default_rng(0)), dtype=np.float64)
-    if x.shape != (n, dim):
-        return f"sample({n}) gave shape {x.shape}"
-    if not np.isfinite(x).all():
-        return f"sample({n}) gave NaN or infinity"
-    log_p = np.asarray(base.log_prob(x), dtype=np.float64)
-    if log_p.shape != (n,) or not np.isfinite(log_p).all():
-        return f"log_prob of its own draws is not {n} finite numbers"
-    try:
-        u = np.asarray(base.to_standard_normal(x), dtype=np.float64)
-        back = np.asarray(base.from_standard_normal(u), dtype=np.float64)
-    except NotImplementedError:
-        return None
-    if u.shape != x.shape or back.shape != x.shape:
-        return f"to_standard_normal and from_standard_normal gave shapes {u.shape} and {back.shape} for {x.shape}"
-    if not np.isfinite(u).all():
-        return f"to_standard_normal(sample({n})) has NaN or infinity"
-    wrong = ~(np.abs(back - x) <= ROUND_TRIP * x.std(axis=0) + 1e-6 * np.abs(x).max(axis=0))
-    if wrong.any():
-        row, column = np.argwhere(wrong)[0]
-        found = f"{back[row, column]:.6g} in coordinate {column} of a draw, where x is {x[row, column]:.6g}"
-        return f"from_standard_normal(to_standard_normal(x)) is {found}"
-    return _find_other_law(u)
+    if len(present.components) == 1:
+        from sklearn.cluster import KMeans  # over a second to import
+
+        k = min(k, len(np.unique(x, axis=0)))
+        clusters = KMeans(k, n_init=KMEANS_RESTARTS, random_state=0).fit(x, sample_weight=weights)
+        start = one_hot(np.asarray(clusters.labels_, dtype=np.int64), k)
+        present = Mixture(np.full(k, 1 / k), [present.components[0]] * k)
+    else:
+        start = posterior(present.log_terms(x))
+
+    def maximise(responsibilities: FloatArray) -> Mixture:
+        """Return weights, means and covariances; a component without any weight stays as it is."""
+        shares, components = [], []
+        parts = zip(present.weights, present.components, weights * responsibilities, strict=True)
+        for weight, component, mass in parts:
+            total = float(mass.sum())
+            share = alpha * total + (1 - alpha) * weight
+            shares.append(share)
+            if share >= EMPTY:
+                mass = mass / total if total > 0 else np.full(len(x), 1 / len(x))
+                component = move_gaussian(component, x, mass, alpha * total / share)
+            components.append(component)
+        return Mixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
+
+    mixture, _ = expectation_maximisation(
+        maximise, lambda mixture: mixture.log_terms(x), start, weights, EM_STEPS, lambda _: -np.inf
+    )
+    used = mixture.weights > EMPTY
+    components = [component for component, kept in zip(mixture.components, used, strict=True) if kept]
+    return Mixture(mixture.weights[used] / mixture.weights[used].sum(), components)
 
 
-def _find_other_law(u: FloatArray) -> str | None:
-    """Return what is not standard normal in u (n, d).
+@dataclass(frozen=True, eq=False)
+class _GaussianInBase:
+    """Common part of the blocks that are Gaussian in the base distribution, N(mean, L L')."""
 
-    Each of four statistics gets a quarter of `FALSE_ALARM`, divided by the number of coordinates or pairs: the mean
-    (normal), the sum of squares (chi-squared with n degrees of freedom), the Kolmogorov distance (bounded by
-    2 exp(-2 n D^2), Massart 1990) and the correlation of two coordinates (t with n - 2 degrees of freedom).
+    gaussian: Gaussian
+
+    @property
+    def _present(self) -> Gaussian | Mixture:
+        return self.gaussian
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates b."""
+        return self.gaussian.dim
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, b)."""
+        return self._present.sample(n, rng)
+
+    def log_prob(self, x: FloatArray, /) -> FloatArray:
+        """Log density at x (n, b), shape (n,)."""
+        return self._present.log_prob(x)
+
+    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
+        """Return L^-1 (x - mean)."""
+        return self.gaussian.to_standard_normal(x)
+
+    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
+        """Return mean + L u."""
+        return self.gaussian.from_standard_normal(u)
+
+    def widen(self, factor: float) -> Any:
+        """Return the block with `factor` times the standard deviations."""
+        return replace(self, gaussian=self.gaussian.widen(factor))
+
+
+@dataclass(frozen=True, eq=False)
+class NormalBlock(_GaussianInBase):
+    """A Normal with fixed covariance whose mean may move in a box |mean - centre|_inf <= radius.
+
+    Args:
+        gaussian: The present Gaussian; in the base distribution the one to start from.
+        radius: In the units of x (0.01 in the paper); inf for no box, 0 for a block that stays.
+        centre: Centre of the box; None takes the mean of `gaussian`.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> block = NormalBlock(Gaussian.standard(2), radius=0.5)
+        >>> elite = np.array([[3.0, 0.1], [1.0, 0.1]])
+        >>> block.project(elite, np.array([0.5, 0.5]), alpha=1.0).gaussian.mean
+        array([0.5, 0.1])
     """
-    n, dim = u.shape
-    level = FALSE_ALARM / 4 / dim
-    room = -float(ndtri(level / 2)) / n**0.5
-    low, high = (2 * float(gammaincinv(n / 2, level / 2)) / n) ** 0.5, (float(chdtri(n, level / 2)) / n) ** 0.5
-    reached, steps = ndtr(np.sort(u, axis=0)), np.arange(n + 1)[:, None] / n
-    distance = np.maximum(steps[1:] - reached, reached - steps[:-1]).max(axis=0)
-    centred = u - u.mean(axis=0)
-    centred /= np.sqrt((centred**2).sum(axis=0))
-    blocks = np.split(np.arange(dim), range(MAX_CORRELATED, dim, MAX_CORRELATED))
-    pairs = np.hstack([block[np.stack(np.triu_indices(len(block), 1))] for block in blocks])
-    products = [centred[:, block].T @ centred[:, block] for block in blocks]
-    correlations = np.concatenate([each[np.triu_indices(len(each), 1)] for each in products])
-    t = -float(stdtrit(n - 2, FALSE_ALARM / 8 / max(pairs.shape[1], 1)))
-    together = t / (n - 2 + t**2) ** 0.5
-    columns = ("in coordinate", np.arange(dim)[None])
-    for what, values, least, most, (at, places) in (
-        ("mean", u.mean(axis=0), -room, room, columns),
-        ("standard deviation", (u**2).mean(axis=0) ** 0.5, low, high, columns),
-        ("Kolmogorov distance", distance, 0.0, (math.log(2 / level) / (2 * n)) ** 0.5, columns),
-        ("correlation", correlations, -together, together, ("between coordinates", pairs)),
-    ):
-        wrong = np.flatnonzero(~((least <= values) & (values <= most)))
-        if len(wrong):
-            where = " and ".join(map(str, places[:, wrong[0]]))
-            found = f"{what} {values[wrong[0]]:.2g} {at} {where}, where {least:.2g} to {most:.2g} fits"
-            return f"to_standard_normal(sample({n})) has {found}"
-    return None
+
+    radius: float = math.inf
+    centre: FloatArray | None = None
+
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NormalBlock":
+        """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_mean`."""
+        centre = self.gaussian.mean if self.centre is None else self.centre
+        target = alpha * (weights @ x) + (1 - alpha) * self.gaussian.mean
+        mean = project_mean(target, centre, self.gaussian.cholesky, self.radius)
+        return replace(self, gaussian=Gaussian(mean, self.gaussian.cholesky), centre=centre)
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianBlock(_GaussianInBase):
+    """A Gaussian whose mean and covariance may move: E[x] and E[x x'] are matched.
+
+    The covariance is drawn towards the present one, see `samplers.proposals.move_gaussian`.
+
+    Example:
+        Ten points in one place have no covariance; the present one counts as three points.
+
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> elite = np.tile([2.0, 1.0], (10, 1))
+        >>> block = GaussianBlock(Gaussian.standard(2)).project(elite, np.full(10, 0.1), alpha=1.0)
+        >>> block.gaussian.mean, block.gaussian.covariance.diagonal().round(3)
+        (array([2., 1.]), array([0.231, 0.231]))
+    """
+
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "GaussianBlock":
+        """Return the projection of alpha Q + (1 - alpha) P, its covariance pulled back."""
+        return GaussianBlock(move_gaussian(self.gaussian, x, weights, alpha))
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureBlock(_GaussianInBase):
+    """A mixture of k Gaussians, moved by expectation-maximisation, see `fit_mixture_towards`.
+
+    Args:
+        gaussian: The Gaussian of the base distribution.
+        k: Number of components at most.
+        mixture: The present mixture; None stands for `gaussian`.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> elite = np.repeat([[4.0, 0.0], [-4.0, 0.0]], 100, axis=0)
+        >>> block = MixtureBlock(Gaussian.standard(2), k=2).project(elite, np.full(200, 1 / 200), alpha=1.0)
+        >>> sorted(float(component.mean[0].round(2)) for component in block.mixture.components)
+        [-4.0, 4.0]
+    """
+
+    k: int
+    mixture: Mixture | None = None
+
+    @property
+    def _present(self) -> Mixture:
+        return Mixture(np.ones(1), (self.gaussian,)) if self.mixture is None else self.mixture
+
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "MixtureBlock":
+        """Return a mixture nearer to alpha Q + (1 - alpha) P."""
+        return replace(self, mixture=fit_mixture_towards(self._present, self.k, x, weights, alpha))
+
+    def widen(self, factor: float) -> "MixtureBlock":
+        """Return the block with `factor` times the standard deviations of every component."""
+        return replace(self, mixture=self._present.widen(factor))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Product(IndependentDistributions):
+    """Independent blocks of consecutive coordinates: a base distribution, or a proposal of the search.
+
+    As a base distribution it announces its blocks to `CrossEntropy(family="blocks")`.
+
+    Args:
+        blocks: In the order of the coordinates: those of this module, or objects with the same methods.
+
+    Raises:
+        ValueError: If there is no block, or one is none.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> gap = BetaBlock(alpha=2.0, beta=2.0, low=1.0, high=40.0)
+        >>> base = Product((gap, NormalBlock(Gaussian.standard(3))))
+        >>> base.dim, base.sample(5, np.random.default_rng(0)).shape
+        (4, (5, 4))
+        >>> base.from_standard_normal(np.zeros((1, 4)))
+        array([[20.5,  0. ,  0. ,  0. ]])
+    """
+
+    def __post_init__(self) -> None:
+        """Make a tuple of the blocks."""
+        object.__setattr__(self, "blocks", tuple(self.blocks))
+        if not self.blocks or not all(hasattr(block, "project") for block in self.blocks):
+            raise ValueError(f"Product: expected one block or more, got {self.blocks!r}.")
+
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Product":
+        """Return the projection of alpha Q + (1 - alpha) P, block by block (equation 2).
+
+        Q has the points x (n, d) with weights (blocks, n) for each block, rows that add up to 1.
+        """
+        return Product(
+            tuple(block.project(part, w, alpha) for (block, part), w in zip(self.split(x), weights, strict=True))
+        )
+
+    def widen(self, factor: float) -> "Product":
+        """Return independent blocks with standard deviations multiplied by about `factor`."""
+        return Product(tuple(block.widen(factor) for block in self.blocks))
+
+
+def announced_blocks(inputs: Inputs) -> Product:
+    """Return the base distribution of some inputs as the product of the blocks in its attribute `blocks`.
+
+    An entry is a block, or has alpha, beta, low, high (and box), or mean and covariance (and radius). A ValueError
+    says what is missing, or that their product is not the base distribution.
+    """
+    announced = getattr(inputs.base, "blocks", None)  # the user's own class
+    if not announced:
+        raise ValueError(
+            f'CrossEntropy: family "blocks" needs a base distribution with an attribute blocks, as Product has; '
+            f'{type(inputs.base).__name__} has none. The family "gaussian" works with any.'
+        )
+    product = Product(tuple(_as_block(entry) for entry in announced))
+    trial = product.sample(4, np.random.default_rng(0))
+    if product.dim != inputs.dim or not np.allclose(product.log_prob(trial), inputs.base.log_prob(trial)):
+        raise ValueError(
+            f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its distribution: mend `blocks`, or "
+            'take family="gaussian", which works with any.'
+        )
+    return product
+
+
+def _as_block(entry: Any) -> Any:
+    """Return the block that an entry describes, one of the classes here or of another package."""
+    if hasattr(entry, "project"):
+        return entry
+    if all(hasattr(entry, name) for name in ("alpha", "beta", "low", "high")):
+        box = getattr(entry, "box", PAPERS_BOX)
+        return BetaBlock(alpha=entry.alpha, beta=entry.beta, low=entry.low, high=entry.high, box=box)
+    if hasattr(entry, "mean") and hasattr(entry, "covariance"):
+        gaussian = Gaussian.from_covariance(entry.mean, entry.covariance)
+        return NormalBlock(gaussian, getattr(entry, "radius", math.inf))
+    raise ValueError(
+        "CrossEntropy: expected a block with alpha, beta, low and high or with mean and covariance, "
+        f'got {type(entry).__name__}; the family "gaussian" works with any base.'
+    )

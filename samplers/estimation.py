@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 from samplers.analysis.reweight import needs_ensemble_run, pool_refits
-from samplers.distributions import find_base_fault
+from samplers.bases import find_base_fault
 from samplers.evaluate import Evaluator
 from samplers.executors import AnyExecutor, find_executor
 from samplers.journal import Journal, JournalError, NothingRecorded

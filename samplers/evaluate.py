@@ -285,7 +285,7 @@ class Executor(Protocol):
 
     Example:
         >>> import samplers
-        >>> isinstance(samplers.LocalProcesses(workers=2), samplers.Executor)
+        >>> isinstance(samplers.executors.LocalProcesses(workers=2), samplers.executors.Executor)
         True
     """
 

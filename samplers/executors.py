@@ -42,6 +42,8 @@ from samplers.workers import (
     starting_processes,
 )
 
+__all__ = ["Executor", "ExecutorError", "FuturesPool", "InProcess", "LocalProcesses", "RayCluster"]
+
 ATTEMPTS = 3
 """Times that a chunk is computed before it is taken apart, and a row before it counts as lost: where 1 worker in 20 is
 killed by chance, a good row of a chunk of several is lost once in 20^6 = 6e7, and a chunk of one row once in 8,000."""
@@ -67,7 +69,7 @@ class InProcess:
     Example:
         >>> import samplers
         >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
-        >>> samplers.estimate(problem, "mc", seed=0, max_sim=1000, executor=samplers.InProcess()).p
+        >>> samplers.estimate(problem, "mc", seed=0, max_sim=1000, executor=samplers.executors.InProcess()).p
         0.017
     """
 
@@ -115,7 +117,7 @@ class LocalProcesses(_Processes):
     Example:
         >>> import samplers
         >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[0], dim=2, vectorized=False)
-        >>> processes = samplers.LocalProcesses(workers=2, time_limit=60.0)
+        >>> processes = samplers.executors.LocalProcesses(workers=2, time_limit=60.0)
         >>> samplers.estimate(problem, "mc", seed=0, max_sim=200, executor=processes).n_sim
         200
     """
@@ -188,7 +190,7 @@ class RayCluster(_Processes):
 
     Example:
         >>> import samplers
-        >>> cluster = samplers.RayCluster(address="ray://head:10001", options={"num_gpus": 0.25})
+        >>> cluster = samplers.executors.RayCluster(address="ray://head:10001", options={"num_gpus": 0.25})
         >>> cluster.workers is None, cluster.options
         (True, {'num_gpus': 0.25})
     """
@@ -249,8 +251,8 @@ def find_executor(workers: int | None, executor: Any) -> Executor:
         return FuturesPool(executor)
     hint = f"; workers={executor} gives {executor} processes" if isinstance(executor, int) else ""
     raise ValueError(
-        'Expected executor to be "ray", samplers.LocalProcesses(...) or another one, an object with submit, or a '
-        f"function that makes one, got {executor!r}{hint}."
+        'Expected executor to be "ray", samplers.executors.LocalProcesses(...) or another one, an object with submit, '
+        f"or a function that makes one, got {executor!r}{hint}."
     )
 
 

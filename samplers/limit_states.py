@@ -15,6 +15,8 @@ from scipy.special import chdtri, ndtr, ndtri
 
 from samplers.problem import FloatArray, FunctionProblem
 
+__all__ = ["Reference", "four_branches", "half_space", "parabola", "plateau", "shell", "two_modes"]
+
 
 class Reference(NamedTuple):
     """A problem and its exact probability of failure at gamma = 0."""

@@ -37,7 +37,7 @@ class Goal:
 
     Example:
         >>> import samplers
-        >>> goal = samplers.Goal(gamma=0.0, max_sim=500)
+        >>> goal = samplers.methods.Goal(gamma=0.0, max_sim=500)
         >>> goal.budget, goal.confidence
         (500, 0.95)
     """
@@ -65,7 +65,7 @@ class Outcome:
 
     Example:
         >>> import samplers
-        >>> outcome = samplers.Outcome.of_counts(10, 1000, confidence=0.95, trace=())
+        >>> outcome = samplers.methods.Outcome.of_counts(10, 1000, confidence=0.95, trace=())
         >>> outcome.p, [round(end, 4) for end in outcome.interval], round(outcome.cov, 3)
         (0.01, [0.0048, 0.0183], 0.315)
     """
@@ -141,8 +141,8 @@ class Part:
     Example:
         >>> import samplers
         >>> safe, bold = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], 1) for at in (9.0, 1.0))
-        >>> strata = samplers.Stratum("careful", 0.99, safe), samplers.Stratum("bold", 0.01, bold)
-        >>> result = samplers.estimate(samplers.StratifiedProblem(strata), "mc", seed=0, max_sim=10_000)
+        >>> strata = samplers.strata.Stratum("careful", 0.99, safe), samplers.strata.Stratum("bold", 0.01, bold)
+        >>> result = samplers.estimate(samplers.strata.StratifiedProblem(strata), "mc", seed=0, max_sim=10_000)
         >>> for part in result.parts:  # P = 0.01 Phi(-1) = 0.00159
         ...     print(part)
         careful (99 % of x): p below 5.1e-04, no failure in 7,250 simulations
@@ -204,18 +204,18 @@ class Interrupted(Exception):
 
     Example:
         >>> import numpy as np, samplers
-        >>> class OneByOne(samplers.Method):
+        >>> class OneByOne(samplers.methods.Method):
         ...     name, stops_at_target = "one-by-one", False
         ...     def steps(self, inputs, goal, rng):
         ...         hits, status = 0, samplers.Status.CONVERGED
         ...         for n in range(1, goal.budget + 1):
         ...             try:
         ...                 f = yield inputs.base.sample(1, rng)
-        ...             except samplers.Interrupted:
+        ...             except samplers.methods.Interrupted:
         ...                 n, status = n - 1, samplers.Status.STOPPED
         ...                 break
         ...             hits += int(f[0] <= goal.gamma)
-        ...         return samplers.Outcome(p=hits / n, interval=(0.0, 1.0), cov=1.0, status=status)
+        ...         return samplers.methods.Outcome(p=hits / n, interval=(0.0, 1.0), cov=1.0, status=status)
         >>> problem = samplers.FunctionProblem(lambda x: x[:, 0], dim=1)
         >>> result = samplers.estimate(problem, OneByOne(), seed=0, max_sim=99, stop=lambda at: at.n_sim == 4)
         >>> result.n_sim, str(result.status)
@@ -319,7 +319,7 @@ class Stepping(Protocol):
 
     Example:
         >>> import samplers
-        >>> isinstance(samplers.MonteCarlo(), samplers.Stepping)
+        >>> isinstance(samplers.MonteCarlo(), samplers.methods.Stepping)
         True
     """
 

@@ -17,7 +17,9 @@ from typing import Any, Literal, Protocol, TypeGuard, get_args, runtime_checkabl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from samplers.distributions import LOG_TWO_PI, as_distribution
+from samplers.bases import LOG_TWO_PI, as_distribution
+
+__all__ = ["EvaluationError", "FunctionProblem", "Problem", "TermGradients", "Terms"]
 
 SHARE_ROUNDING = 1e-6
 """Shares of strata add up to 1 within this."""
@@ -189,7 +191,7 @@ class Distribution(Protocol):
         ...     def from_standard_normal(self, u):
         ...         return stats.halfnorm.ppf(stats.norm.cdf(u))
         >>> base = HalfNormal()
-        >>> isinstance(base, samplers.Distribution)
+        >>> isinstance(base, samplers.distributions.Distribution)
         True
         >>> base.from_standard_normal(np.zeros((1, 2))).round(4)
         array([[0.6745, 0.6745]])
@@ -237,7 +239,7 @@ class Problem(Inputs, Protocol):
         >>> import samplers
         >>> class Disc:
         ...     dim = 2
-        ...     base = samplers.StandardNormal(2)
+        ...     base = samplers.distributions.StandardNormal(2)
         ...     def evaluate(self, x):
         ...         return 3.0 - (x**2).sum(axis=1) ** 0.5
         >>> isinstance(Disc(), samplers.Problem)
@@ -315,7 +317,7 @@ def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
 
 
 def read_strata(base: Any) -> tuple[Any, ...]:
-    """Return the strata of a base distribution (see `samplers.Distribution`), none where it has fewer than two.
+    """Return the strata of a base distribution (see `Distribution`), none where it has fewer than two.
 
     Raises:
         ValueError: If names, shares or bases do not fit.
@@ -345,7 +347,7 @@ class StandardNormal:
 
     Example:
         >>> import numpy as np, samplers
-        >>> base = samplers.StandardNormal(2)
+        >>> base = samplers.distributions.StandardNormal(2)
         >>> base.log_prob(np.zeros((1, 2))).round(4)  # -log(2 pi)
         array([-1.8379])
     """

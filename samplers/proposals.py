@@ -21,8 +21,8 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.special import logsumexp
 
+from samplers.bases import Gaussian
 from samplers.components import expectation_maximisation, shrink_covariance, start_from_centres
-from samplers.distributions import Gaussian
 from samplers.problem import FloatArray
 
 __all__ = ["Gaussian", "Mixture", "correct_eigenvalues", "fit_proposal_mixture", "fit_shrunk_gaussian"]

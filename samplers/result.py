@@ -156,7 +156,7 @@ class Estimate(EstimateData, Kept):
     def base_uncertainty(self) -> BaseUncertainty | None:
         """The interval of p that the events behind a fitted base distribution allow, from the same simulations.
 
-        None where the base has no refits; see `BaseUncertainty` and `samplers.FittedBase`.
+        None where the base has no refits; see `BaseUncertainty` and `samplers.analysis.FittedBase`.
         """
         return compute_base_uncertainty(self)
 
@@ -177,7 +177,7 @@ class Estimate(EstimateData, Kept):
         return judge_estimate(self, max_p, None if given_base else self.base_uncertainty)
 
     def pilot(self, seconds: float | None = None) -> Pilot:
-        """Return this run as one that others are planned from, by `samplers.plan_runs`.
+        """Return this run as one that others are planned from, by `samplers.plan`.
 
         Args:
             seconds: Its wall time [s].
@@ -189,7 +189,7 @@ class Estimate(EstimateData, Kept):
             >>> import samplers
             >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
             >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)  # 16 hits
-            >>> [run.n_sim for run in samplers.plan_runs(result.pilot(), target_cov=0.1)]
+            >>> [run.n_sim for run in samplers.plan(result.pilot(), target_cov=0.1)]
             [62400]
         """
         again = self.method.stops_at_target and self.sample is not None

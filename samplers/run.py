@@ -51,7 +51,9 @@ from samplers.sample import (
     confidence_sequence,
     gain_over_monte_carlo,
 )
-from samplers.strata import SumOfStrata
+from samplers.sum_of_strata import SumOfStrata
+
+__all__ = ["Progress", "Run", "RunArguments"]
 
 MOST_SIMULATIONS = 10**12
 """Largest `max_sim`: more is a slip of the keyboard."""
@@ -67,7 +69,7 @@ class RunArguments:
         ValueError: If an argument is out of range; the text says what was expected.
 
     Example:
-        >>> from samplers import RunArguments
+        >>> from samplers.run import RunArguments
         >>> arguments = RunArguments(max_sim=6000, seed=1)
         >>> arguments.gamma, arguments.confidence, arguments.replicates
         (0.0, 0.95, 1)

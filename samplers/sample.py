@@ -24,6 +24,23 @@ from scipy.special import betaincinv, logsumexp, ndtr, ndtri, stdtrit
 
 from samplers.problem import FloatArray
 
+__all__ = [
+    "DrawWeights",
+    "Failures",
+    "Layer",
+    "Level",
+    "Sample",
+    "Status",
+    "binomial_cov",
+    "bound_missed",
+    "clopper_pearson",
+    "effective_sample_size",
+    "gain_over_monte_carlo",
+    "log_normal_interval",
+    "next_level",
+    "normalise_weights",
+]
+
 
 class Status(str, Enum):
     """End of a run; prints as its value.

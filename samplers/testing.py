@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from samplers.distributions import find_base_fault
+from samplers.bases import find_base_fault
 from samplers.estimation import estimate
 from samplers.limit_states import half_space, normal_cdf, two_modes
 from samplers.method import Stepping
@@ -23,6 +23,8 @@ from samplers.replicate import NOT_KNOWN
 from samplers.result import Estimate
 from samplers.run import Run, RunArguments
 from samplers.sample import Status
+
+__all__ = ["check_base", "check_method"]
 
 
 def check_method(method: Stepping) -> None:

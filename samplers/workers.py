@@ -35,7 +35,7 @@ class ExecutorError(RuntimeError):
     Example:
         An executor of your own raises it where waiting and trying again are of no use.
 
-        >>> from samplers import ExecutorError
+        >>> from samplers.executors import ExecutorError
         >>> ExecutorError("The queue of the cluster is closed.").final
         True
     """

@@ -19,6 +19,7 @@ import agents
 import rare_envs
 import samplers
 import training
+from samplers.strata import StratifiedProblem, Stratum
 
 CAR_FOLLOWING, CUT_IN, HARD_BRAKE, HIGHWAY = (
     f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "HardBrake", "Highway")
@@ -191,9 +192,9 @@ def test_egos_by_name(name: str, env_id: str) -> None:
 
 
 def test_methods_have_names_and_defaults() -> None:
-    assert set(METHODS) <= set(samplers.METHODS)
+    assert set(METHODS) <= set(samplers.methods.METHODS)
     for name, cls in METHODS.items():
-        assert isinstance(samplers.get_method(name), getattr(samplers, cls))
+        assert isinstance(samplers.methods.get_method(name), getattr(samplers, cls))
 
 
 def test_estimate_takes_its_arguments_and_fills_an_estimate() -> None:
@@ -220,11 +221,15 @@ def test_estimate_takes_its_arguments_and_fills_an_estimate() -> None:
 
 def test_a_sum_of_strata_is_estimated_with_its_parts() -> None:
     looked, unseen = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 1.0))
-    strata = samplers.Stratum("looked", 0.99, looked), samplers.Stratum("unseen", 0.01, unseen, log_sd=0.5)
-    result = samplers.estimate(samplers.StratifiedProblem(strata), "mc", seed=0, max_sim=20_000)
+    strata = (
+        Stratum("looked", 0.99, looked),
+        Stratum("unseen", 0.01, unseen, log_sd=0.5),
+    )
+    result = samplers.estimate(StratifiedProblem(strata), "mc", seed=0, max_sim=20_000)
     assert [part.name for part in result.parts] == ["looked", "unseen"] and result.base_uncertainty is not None
     assert (
-        isinstance(result.parts[0], samplers.Part) and result.parts[1].interval[0] < 0.159 < result.parts[1].interval[1]
+        isinstance(result.parts[0], samplers.methods.Part)
+        and result.parts[1].interval[0] < 0.159 < result.parts[1].interval[1]
     )
 
 

@@ -6,6 +6,7 @@ from scipy import stats
 import rare_envs
 import samplers
 from benchmarks.estimators.against_truth import compare_with_truth, read_truths
+from samplers.methods import METHODS
 
 TRUTH = [row for row in read_truths() if not row["stratum"]]
 
@@ -48,7 +49,7 @@ def test_a_few_seeds(method: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [name for name in samplers.METHODS if name != "series"])  # made for many dimensions
+@pytest.mark.parametrize("method", [name for name in METHODS if name != "series"])  # made for many dimensions
 @pytest.mark.parametrize("row", TRUTH, ids=lambda row: f"{row['env_id']}-{row['base']}")
 def test_forty_seeds(row: dict[str, float], method: str) -> None:
     cell = compare_with_truth(row, method, range(1000, 1040))

@@ -24,7 +24,7 @@ from importlib.util import find_spec
 import samplers
 assert [name for name in ("torch", "gymnasium", "stable_baselines3", "cvxpy") if find_spec(name)] == []
 problem = samplers.FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / 10**0.5, dim=10)
-for method in (name for name in samplers.METHODS if name != "series"):  # terms with gradients
+for method in (name for name in samplers.methods.METHODS if name != "series"):  # terms with gradients
     workers = 2 if method == "mc" else None
     print(method, samplers.estimate(problem, method, seed=0, max_sim=3000, workers=workers).p)
 """

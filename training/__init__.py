@@ -21,3 +21,8 @@ _LAZY = {
 """Names that need torch or Stable-Baselines3, which take seconds to load; the command line starts without them."""
 
 __getattr__ = make_lazy_getattr(__name__, _LAZY)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, used already or not."""
+    return __all__

@@ -112,7 +112,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = COMPARISON_RESULT,
 ) -> None:
     """Compare every method with the truth and write the result."""
-    chosen = method.split(",") if method else [name for name in samplers.METHODS if name != "series"]
+    chosen = method.split(",") if method else [name for name in samplers.methods.METHODS if name != "series"]
     kept = json.loads(out.read_text())["cells"] if method and out.exists() else []
     cells = {(cell["env_id"], cell["base"], cell["method"]): cell for cell in kept}
     for row in read_truths():

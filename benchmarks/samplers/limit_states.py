@@ -16,9 +16,9 @@ from scipy.integrate import quad
 from scipy.special import ndtr, ndtri
 from scipy.stats import chi2, ncx2
 
-from samplers import StratifiedProblem, Stratum
 from samplers.limit_states import half_space, integrate, normal_cdf, normal_mean
 from samplers.problem import FloatArray, FunctionProblem
+from samplers.strata import StratifiedProblem, Stratum
 
 Seed = int | tuple[int, ...]
 PointFunction = Callable[[FloatArray], FloatArray]

@@ -22,7 +22,8 @@ from threadpoolctl import threadpool_limits
 from benchmarks.samplers.limit_states import PointFunction
 from benchmarks.samplers.other_libraries import OTHER_SOLVERS, Solver
 from benchmarks.samplers.problems import find_problem, limit_state
-from samplers import METHODS, Estimate, Stepping, estimate
+from samplers import Estimate, estimate
+from samplers.methods import METHODS, Stepping
 from samplers.problem import FloatArray
 
 _Job = TypeVar("_Job")
@@ -39,7 +40,7 @@ class Job:
     """One run to be made."""
 
     method: str
-    """A name of `samplers.METHODS`, or `module:attribute`; see `find_method`."""
+    """A name of `samplers.methods.METHODS`, or `module:attribute`; see `find_method`."""
     problem: str
     seed: int
     max_sim: int | None = None
@@ -126,7 +127,7 @@ def find_method(name: str) -> Stepping | Solver:
     """Return a method by its name, or by where it stands.
 
     Args:
-        name: A name of `samplers.METHODS` or `OTHER_SOLVERS`; or `module:attribute`, the attribute a class with the
+        name: A name of `METHODS` or `OTHER_SOLVERS`; or `module:attribute`, the attribute a class with the
             protocol of our methods (`samplers.testing.check_method` checks it) or a function that is called as
             solver(problem, seed=..., max_sim=...) and returns p, low and high, with the c.o.v. if it knows it.
 

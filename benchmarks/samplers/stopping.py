@@ -43,7 +43,7 @@ def list_cases() -> list[Case]:
     """Return eight cases: counts, light and heavy weights, and a sum over strata."""
     p_k = (1e-4, 2e-2)
     strata = [
-        samplers.Stratum(name, share, half_space(2, -float(ndtri(p))).problem)
+        samplers.strata.Stratum(name, share, half_space(2, -float(ndtri(p))).problem)
         for name, share, p in zip(("often", "seldom"), (0.9, 0.1), p_k, strict=True)
     ]
     known = (
@@ -57,7 +57,10 @@ def list_cases() -> list[Case]:
     )
     cases = [Case(name, state.problem, state.p, method, target) for name, state, method, target in known]
     whole = 0.9 * p_k[0] + 0.1 * p_k[1]
-    return [*cases, Case("two strata", samplers.StratifiedProblem(strata), whole, samplers.MonteCarlo(batch=500), 0.1)]
+    return [
+        *cases,
+        Case("two strata", samplers.strata.StratifiedProblem(strata), whole, samplers.MonteCarlo(batch=500), 0.1),
+    ]
 
 
 def find_looks(result: samplers.Estimate, target_cov: float) -> list[Interval]:

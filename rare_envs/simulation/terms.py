@@ -34,7 +34,7 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTerms:
-    """f of n rollouts and the J terms of the measure by which to search; has what `samplers.Terms` has."""
+    """f of n rollouts and the J terms of the measure by which to search; has what `samplers.problem.Terms` has."""
 
     f: FloatArray
     """The measure, shape (n,)."""
@@ -78,7 +78,7 @@ def simulate_terms(world: World, gamma: float, simulate: Callable[[World], Itera
 
 @dataclass(frozen=True, eq=False)
 class EpisodeGradients:
-    """Gradients of one term of each of n rollouts; has what `samplers.TermGradients` has."""
+    """Gradients of one term of each of n rollouts; has what `samplers.problem.TermGradients` has."""
 
     values: FloatArray
     """With respect to x, shape (n, d); NaN in rows that have none."""

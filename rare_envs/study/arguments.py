@@ -24,8 +24,11 @@ from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.registry import find_scenario, split_layout
 
 if TYPE_CHECKING:
-    from samplers import Estimate, Executor, RunArguments, Stepping
+    from samplers import Estimate
+    from samplers.executors import Executor
+    from samplers.methods import Stepping
     from samplers.problem import OnError
+    from samplers.run import RunArguments
 
 MAX_MESSAGE = 2_000
 """Characters of a message, which may repeat a name or a value of any length; of a longer one the middle is left out."""
@@ -265,7 +268,7 @@ class Question:
         _ = self.run_arguments
         if self.chunk is not None:
             check_whole("chunk", self.chunk, 1)
-        method = samplers.get_method(self.method)
+        method = samplers.methods.get_method(self.method)
         find_scenario(self.env_id)
         return method
 
@@ -298,10 +301,10 @@ class ExecutorOptions:
             raise ValueError(f"Expected --memory-limit to be a number of GiB above 0, got {self.memory_limit}.")
         memory = None if self.memory_limit is None else self.memory_limit * 2.0**30
         if self.executor == "ray":
-            return samplers.RayCluster(
+            return samplers.executors.RayCluster(
                 self.address, workers=self.workers, time_limit=self.time_limit, memory_limit=memory
             )
-        return samplers.LocalProcesses(self.workers, time_limit=self.time_limit, memory_limit=memory)
+        return samplers.executors.LocalProcesses(self.workers, time_limit=self.time_limit, memory_limit=memory)
 
 
 for _kind in (Question, ExecutorOptions):

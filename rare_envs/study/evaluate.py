@@ -69,7 +69,7 @@ UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity")
 
 def run(
     study: Study,
-    progress: bool | Callable[[samplers.Progress], None] = False,
+    progress: bool | Callable[[samplers.run.Progress], None] = False,
     journal: Journal | None = None,
     executor: Executor | None = None,
     folder: Path | None = None,
@@ -80,8 +80,8 @@ def run(
         study: From `prepare`.
         progress: True for a bar on standard error, or a function, as in `samplers.estimate`.
         journal: Keeps finished simulations, and has those of an interrupted run.
-        executor: Where simulations are made, such as `samplers.LocalProcesses(2)`; None for here. The answer does not
-            depend on it, see `chunk` of `Question`.
+        executor: Where simulations are made, such as `samplers.executors.LocalProcesses(2)`; None for here. The answer
+            does not depend on it, see `chunk` of `Question`.
         folder: Gets the table of all simulations; None for no table.
 
     Returns:
@@ -438,7 +438,7 @@ def compare_egos(
     force: bool = False,
     algo_b: str | None = None,
     stats_b: str | None = None,
-) -> tuple[samplers.Comparison, dict[str, Any]]:
+) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
     """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end."""
     if out is not None and not force:
         writing.check_no_results(out, COMPARISON)
@@ -484,33 +484,35 @@ def compare_egos(
     return found, answer
 
 
-def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.PlannedRun, ...]:
+def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.analysis.PlannedRun, ...]:
     """Return what the method of a run, of which result.json holds this, and plain Monte Carlo need."""
     described = recorded.get("method")
     name = described.get("name") if isinstance(described, Mapping) else None
     p, cov, n_sim, seconds = (_read_number(recorded, each) for each in ("p", "cov", "n_sim", "seconds"))
     with as_bad_input(ValueError):
-        method = samplers.get_method(name if isinstance(name, str) else reprlib.repr(name))
+        method = samplers.methods.get_method(name if isinstance(name, str) else reprlib.repr(name))
         final = None if recorded.get("final_draws") is None else int(_read_number(recorded, "final_draws"))
         if final is not None and final > n_sim:
             raise ValueError(f"The result says {final} final draws of {n_sim:g} simulations.")
         kept = final if method.stops_at_target else None
-        pilot = samplers.Pilot(method=method.name, p=p, cov=cov, n_sim=int(n_sim), final_draws=kept, seconds=seconds)
-        return samplers.plan_runs(pilot, target_cov)
+        pilot = samplers.analysis.Pilot(
+            method=method.name, p=p, cov=cov, n_sim=int(n_sim), final_draws=kept, seconds=seconds
+        )
+        return samplers.plan(pilot, target_cov)
 
 
 def plan_by_pilots(
     question: Question, methods: Sequence[str], target_cov: float, progress: bool = False
-) -> tuple[samplers.PlannedRun, ...]:
+) -> tuple[samplers.analysis.PlannedRun, ...]:
     """Run a pilot by each method, and return what each needs; plain Monte Carlo last."""
-    found: dict[str, samplers.PlannedRun] = {}
+    found: dict[str, samplers.analysis.PlannedRun] = {}
     with as_bad_input(ValueError):
-        chosen = {name: samplers.get_method(name) for name in methods}  # before a pilot, which may take hours
+        chosen = {name: samplers.methods.get_method(name) for name in methods}  # before a pilot, which may take hours
     study = prepare(replace(question, method=methods[0], ensemble_run=False))
     for name, method in chosen.items():
         with as_bad_input(ValueError):
             report = run(replace(study, question=replace(study.question, method=name), method=method), progress)
-            planned = samplers.plan_runs(report.estimate.pilot(report.seconds), target_cov)
+            planned = samplers.plan(report.estimate.pilot(report.seconds), target_cov)
             found |= {each.method: each for each in planned if each.method not in found}
     return tuple(sorted(found.values(), key=lambda each: each.method == "mc"))
 

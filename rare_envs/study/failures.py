@@ -261,7 +261,7 @@ class FailureMode:
 
     crash: str
     """Kind of crash; "" where that is not known."""
-    share: samplers.Share
+    share: samplers.analysis.Share
     """Its part of p, with an interval."""
     failure: int | None
     """Number of its most likely failure in the list of failures; None if the list has none of it."""
@@ -361,7 +361,7 @@ def _find_nearest(u: FloatArray, among: FloatArray) -> NDArray[np.int64]:
 class CrashKinds:
     """Crashes in which the failures of a run ended."""
 
-    shares: Mapping[str, samplers.Share] = field(default_factory=dict)
+    shares: Mapping[str, samplers.analysis.Share] = field(default_factory=dict)
     """p by kind of crash; its parts add up to p. Empty if nothing failed, or it is not known."""
     listed: tuple[dict[str, Any] | None, ...] = ()
     """The crash of each failure of the list, see `rare_envs.traffic.crash.describe_crash`; empty if it is not known."""
@@ -385,7 +385,7 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> t
         kinds.update(_label_scenarios(x, crash))
         described.update((digest, describe_crash(crash, row)) for row, digest in enumerate(digest_scenarios(x)))
 
-    shares: Mapping[str, samplers.Share] = {}
+    shares: Mapping[str, samplers.analysis.Share] = {}
     severity = None
     if known.any():
         if problem.varies:
@@ -416,7 +416,7 @@ def _drop_repeated(failures: samplers.Failures) -> samplers.Failures:
 
 def _weigh_crashes(
     problem: DrivingProblem, estimate: samplers.Estimate, by_scenario: dict[bytes, str]
-) -> tuple[dict[str, samplers.Share], Severity | None]:
+) -> tuple[dict[str, samplers.analysis.Share], Severity | None]:
     """Return p by kind of crash and the severity, from failing points that are driven again once for both."""
     if estimate.sample is None or not estimate.p:  # no failures, or the search's alone
         return {}, None

@@ -106,7 +106,7 @@ class Study:
 
     question: Question
     problem: DrivingProblem
-    method: samplers.Stepping
+    method: samplers.methods.Stepping
     other_bases: Mapping[str, Distribution] = field(default_factory=dict)
     """Distributions of x under the other base distributions that the question names."""
     ego_was_given: bool = False

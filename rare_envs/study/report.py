@@ -139,7 +139,7 @@ class Repeatability(NamedTuple):
         return ""
 
 
-def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.Verdict:
+def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.analysis.Verdict:
     """Return whether a rate is below a limit; undecided for a reason, if there is one."""
     ends = rate.interval_per_million_km
     return judge_ends(limit, ends, rate.confidence, reason, quantity="collisions per million km")
@@ -182,7 +182,7 @@ class Report:
     earlier_seconds: float = 0.0
 
     @cached_property
-    def sensitivity(self) -> samplers.Sensitivity | str | None:
+    def sensitivity(self) -> samplers.analysis.Sensitivity | str | None:
         """What p is sensitive to, or the reason why that is not known; None if the question does not ask for it."""
         if not self.study.question.sensitivity:
             return None
@@ -265,7 +265,7 @@ class Report:
         return self.kinds.listed or (None,) * len(self.estimate.failures)
 
     @cached_property
-    def verdict(self) -> samplers.Verdict | None:
+    def verdict(self) -> samplers.analysis.Verdict | None:
         """Whether p, or the rate, is below the limit of the question; None without a limit."""
         question = self.study.question
         if question.max_rate is not None:
@@ -277,7 +277,7 @@ class Report:
         found = self.estimate.meets(question.max_p, question.assume_traffic)
         return replace(found, decision="undecided", reason=self.indecision) if self.indecision else found
 
-    def _judge_rate(self, limit: float, assume_traffic: bool) -> samplers.Verdict:
+    def _judge_rate(self, limit: float, assume_traffic: bool) -> samplers.analysis.Verdict:
         return judge_rate(limit, self.find_judged_rate(assume_traffic), self.indecision)
 
     @property
@@ -367,7 +367,7 @@ class Report:
         value: float,
         cov: float,
         sampling: Interval,
-        uncertainty: samplers.BaseUncertainty | None,
+        uncertainty: samplers.analysis.BaseUncertainty | None,
         most: float = 1.0,
     ) -> CollisionRate | None:
         """Return the rate of what has a value per event, at most that of the whole: with its base's interval if any."""
@@ -395,9 +395,9 @@ class Report:
         )
 
     @cached_property
-    def other_bases(self) -> dict[str, samplers.Reweighted | str]:
+    def other_bases(self) -> dict[str, samplers.analysis.Reweighted | str]:
         """P under the other base distributions that the question names, by name, or why this run does not give it."""
-        found: dict[str, samplers.Reweighted | str] = {}
+        found: dict[str, samplers.analysis.Reweighted | str] = {}
         for name, base in self.study.other_bases.items():
             try:
                 found[name] = self.estimate.reweight(base)
@@ -431,7 +431,9 @@ class Report:
             "modes": [mode.to_dict() for mode in self.kinds.modes],
             "curve": convert(self.curve),
             "severity": convert(self.kinds.severity),
-            "sensitivity": self.sensitivity.to_dict() if isinstance(self.sensitivity, samplers.Sensitivity) else None,
+            "sensitivity": self.sensitivity.to_dict()
+            if isinstance(self.sensitivity, samplers.analysis.Sensitivity)
+            else None,
             "failures": [
                 {
                     "parameters": self._parameters(one.x),

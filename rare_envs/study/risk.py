@@ -181,7 +181,7 @@ class Risk:
         return sum_people(self.events)
 
     @cached_property
-    def verdict(self) -> samplers.Verdict | None:
+    def verdict(self) -> samplers.analysis.Verdict | None:
         """Whether the sum is below the limit of the question; None without a limit."""
         limit = self.scenarios[0].report.study.question.max_rate
         if limit is None:
@@ -189,7 +189,7 @@ class Risk:
         missing = [f"{text.name_scenario(name)} is left out" for name in self.left_out]
         reason = next(filter(None, [*missing, *(each.report.indecision for each in self.scenarios)]), "")
 
-        def judge(assume_traffic: bool) -> samplers.Verdict:
+        def judge(assume_traffic: bool) -> samplers.analysis.Verdict:
             found = [(each.report.find_judged_rate(assume_traffic), each.rate.site_log_sd) for each in self.scenarios]
             rates = tuple(replace(rate, site_log_sd=spread) for rate, spread in found)
             return judge_rate(limit, exposure.TotalRate(rates), reason)

@@ -280,14 +280,14 @@ def print_report(report: Report, out: Path | None = None, details: bool = False)
     for line in lines:
         console.print(line, style="yellow" if line.startswith("Warning") else None)
     asked = [_write_row(*row) for row in _list_other_bases(report)]
-    asked += indent_lines(report.sensitivity) if isinstance(report.sensitivity, samplers.Sensitivity) else []
+    asked += indent_lines(report.sensitivity) if isinstance(report.sensitivity, samplers.analysis.Sensitivity) else []
     for line in (*asked, *(list_details(report, out) if details else ())):
         console.print(line)
     for line in gate:
         console.print(line, style="bold")
 
 
-def list_gate(verdict: samplers.Verdict | None) -> list[str]:
+def list_gate(verdict: samplers.analysis.Verdict | None) -> list[str]:
     """Return the lines of a verdict, the last of them with the decision, its exit code and its cause."""
     if verdict is None:
         return []

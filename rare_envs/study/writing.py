@@ -201,7 +201,7 @@ def write_run(folder: Path, report: Report) -> None:
         x = np.stack([fault.x for fault in faults])
         _write_table(folder / run_folder.FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
     save_pictures(folder, report)
-    if isinstance(report.sensitivity, samplers.Sensitivity):
+    if isinstance(report.sensitivity, samplers.analysis.Sensitivity):
         with saved_figure(folder / run_folder.SENSITIVITY, 3.6) as figure:
             report.sensitivity.plot(figure.subplots())
     if kinds.severity is not None and kinds.severity.largest_delta_v > SEVERE:

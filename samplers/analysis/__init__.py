@@ -9,7 +9,8 @@ from samplers.analysis.expectation import (
     expect_over_failures,
     expect_under_refits,
 )
-from samplers.analysis.reweight import Reweighted
+from samplers.analysis.gate import Pilot, PlannedRun, Verdict, plan
+from samplers.analysis.reweight import FittedBase, Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 from samplers.analysis.weighted import NO_OUTCOME_LABEL, Share, WeightedFailures, sum_by_label, weigh_failures
 
@@ -19,14 +20,19 @@ __all__ = [
     "Curve",
     "Exceedance",
     "FailureExpectation",
+    "FittedBase",
+    "Pilot",
+    "PlannedRun",
     "RefitBand",
     "Reweighted",
     "Sensitivity",
     "Share",
+    "Verdict",
     "WeightedFailures",
     "compute_exceedance",
     "expect_over_failures",
     "expect_under_refits",
+    "plan",
     "sum_by_label",
     "weigh_failures",
 ]

@@ -128,7 +128,7 @@ def expect_under_refits(
         >>> from types import SimpleNamespace
         >>> from samplers.analysis.weighted import weigh_failures
         >>> from samplers.proposals import Gaussian
-        >>> class FittedNormal(samplers.StandardNormal):
+        >>> class FittedNormal(samplers.distributions.StandardNormal):
         ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
         ...     clusters, fitted_to, family = 17, "40 events of 17 scenes", "normal"
         >>> problem = SimpleNamespace(dim=1, base=FittedNormal(1), evaluate=lambda x: 1.0 - x[:, 0])

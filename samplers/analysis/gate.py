@@ -221,7 +221,7 @@ class PlannedRun(Reported):
     """Wall time [s], if the pilot's is known."""
 
 
-def plan_runs(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
+def plan(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
     """Return what the method of a pilot needs, and plain Monte Carlo.
 
     Args:
@@ -233,7 +233,7 @@ def plan_runs(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
 
     Example:
         >>> pilot = Pilot(method="two-stage", p=1e-4, cov=0.02, n_sim=6000, final_draws=2000, seconds=12.0)
-        >>> [(run.method, run.n_sim, run.seconds) for run in plan_runs(pilot, target_cov=0.01)]
+        >>> [(run.method, run.n_sim, run.seconds) for run in plan(pilot, target_cov=0.01)]
         [('two-stage', 12000, 24.0), ('mc', 99990000, 199980.0)]
     """
     check_number("target_cov", target_cov, 0.0, math.inf)

@@ -32,7 +32,7 @@ from samplers.analysis.weighted import (
     interval_of_sum,
     require_sample,
 )
-from samplers.distributions import as_distribution, convert
+from samplers.bases import as_distribution, convert
 from samplers.method import EstimateData
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Interval, Sample, add_unseen, effective_number, raise_log_end
@@ -70,10 +70,11 @@ class FittedBase(Distribution, Protocol):
     Example:
         >>> import samplers
         >>> from samplers.proposals import Gaussian
-        >>> class FittedNormal(samplers.StandardNormal):
+        >>> class FittedNormal(samplers.distributions.StandardNormal):
         ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
         ...     clusters, fitted_to, family = 17, "40 events of 17 scenes", "normal"
-        >>> [isinstance(base, samplers.FittedBase) for base in (FittedNormal(1), samplers.StandardNormal(1))]
+        >>> bases = FittedNormal(1), samplers.distributions.StandardNormal(1)
+        >>> [isinstance(base, samplers.analysis.FittedBase) for base in bases]
         [True, False]
     """
 

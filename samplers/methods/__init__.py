@@ -12,7 +12,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from samplers.mcmc import RootedPoints
-from samplers.method import Choice, Goal, Stepping, Steps, offer_of
+from samplers.method import Choice, Goal, Interrupted, Outcome, Part, Stepping, Steps, offer_of
 from samplers.methods.base import Method, noise_mask
 from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
@@ -25,6 +25,23 @@ from samplers.methods.surrogate import Surrogate, SurrogateRun
 from samplers.methods.two_stage.method import TwoStage
 from samplers.output import register_stored
 from samplers.problem import Inputs, check_name, check_settings
+from samplers.sample import Level, Sample, Status
+
+__all__ = [
+    "METHODS",
+    "Auto",
+    "Goal",
+    "Interrupted",
+    "Level",
+    "Method",
+    "Outcome",
+    "Part",
+    "Sample",
+    "Status",
+    "Stepping",
+    "Steps",
+    "get_method",
+]
 
 FEW = 1000
 """Simulations up to which f is first learned by kriging; with more, `TwoStage` has the room for a search of its own."""
@@ -180,7 +197,7 @@ def get_method(name: str, **settings: Any) -> Stepping:
 
     Example:
         >>> import samplers
-        >>> samplers.get_method("mc", n=5000)
+        >>> samplers.methods.get_method("mc", n=5000)
         MonteCarlo(n=5000, batch=10000)
     """
     if not isinstance(name, str) or name not in METHODS:

@@ -13,8 +13,8 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_ch
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.bases import DrawnByItsMap
 from samplers.components import MixtureComponent
-from samplers.distributions import DrawnByItsMap
 from samplers.method import Goal, Stepping
 from samplers.problem import Distribution, FloatArray, Inputs, OnError
 from samplers.run import Run, RunArguments
@@ -27,12 +27,13 @@ class Method(Stepping, Protocol):
 
     Example:
         >>> import numpy as np, samplers
-        >>> class OneBatch(samplers.Method):
+        >>> class OneBatch(samplers.methods.Method):
         ...     name, stops_at_target = "one-batch", False
         ...     def steps(self, inputs, goal, rng):
         ...         n = min(goal.budget, 4000)
         ...         f = yield inputs.base.sample(n, rng)
-        ...         return samplers.Outcome.of_counts(int((f <= goal.gamma).sum()), n, goal.confidence, trace=())
+        ...         hits = int((f <= goal.gamma).sum())
+        ...         return samplers.methods.Outcome.of_counts(hits, n, goal.confidence, trace=())
         >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
         >>> result = samplers.estimate(problem, OneBatch(), seed=0)
         >>> result.n_sim, result.p

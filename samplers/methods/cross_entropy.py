@@ -7,11 +7,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from samplers.distributions import Gaussian
+from samplers.bases import Gaussian
+from samplers.distributions import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.importance import Search
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
-from samplers.methods.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs, check_settings, is_number
 from samplers.sample import Status, next_level, normalise_weights
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtri
 
-from samplers.distributions import Gaussian
+from samplers.bases import Gaussian
 from samplers.importance import Draws, count_final_draws, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise

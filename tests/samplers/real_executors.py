@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 import samplers
+from samplers.executors import FuturesPool
 
 LIBRARIES = {"futures": "concurrent.futures", "loky": "loky", "dask": "distributed", "ray": "ray"}
 """What an executor needs; `local` needs nothing."""
@@ -38,22 +39,22 @@ def open_executor(name: str, workers: int = 2, **limits: Any) -> Iterator[Any]:
         limits: time_limit [s], memory_limit [bytes].
     """
     if name == "here":
-        yield samplers.InProcess()
+        yield samplers.executors.InProcess()
     elif name == "local":
-        yield samplers.LocalProcesses(workers, **limits)
+        yield samplers.executors.LocalProcesses(workers, **limits)
     elif name == "futures":
         spawn = multiprocessing.get_context("spawn")
-        yield samplers.FuturesPool(lambda: ProcessPoolExecutor(workers, mp_context=spawn), workers=workers, **limits)
+        yield FuturesPool(lambda: ProcessPoolExecutor(workers, mp_context=spawn), workers=workers, **limits)
     elif name == "loky":
         import loky
 
-        yield samplers.FuturesPool(lambda: loky.ProcessPoolExecutor(workers), workers=workers, **limits)
+        yield FuturesPool(lambda: loky.ProcessPoolExecutor(workers), workers=workers, **limits)
     elif name == "dask":
         with open_dask(workers) as pool:
-            yield samplers.FuturesPool(pool, **limits)
+            yield FuturesPool(pool, **limits)
     else:
         os.environ.setdefault("RAY_worker_niceness", "0")  # it is 15, so that on a busy machine they hardly begin
-        yield samplers.RayCluster(workers=workers, **limits)
+        yield samplers.executors.RayCluster(workers=workers, **limits)
 
 
 @contextmanager

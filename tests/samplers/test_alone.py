@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.methods.blocks import project_mean
+from samplers.distributions import project_mean
 
 SCRIPT = Path(__file__).with_name("without_drivers.py")
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from samplers.problem import FloatArray, StandardNormal
 from samplers.run import RunArguments
 
 
-@pytest.mark.parametrize("door", [samplers.estimate, samplers.Method.start])
+@pytest.mark.parametrize("door", [samplers.estimate, samplers.methods.Method.start])
 def test_the_defaults_of_the_front_doors_are_these(door):
     defaults = {name: each.default for name, each in inspect.signature(door).parameters.items()}
     assert {each.name: defaults[each.name] for each in fields(RunArguments)} == vars(RunArguments())

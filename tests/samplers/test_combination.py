@@ -96,7 +96,7 @@ def test_samples_are_merged_as_the_runs_are():
 
 def test_a_run_on_its_way_has_no_part_in_the_mean():
     ends = [outcome(1e-4), outcome(2e-4)]
-    level = samplers.Level(gamma=1.0, p=0.1, estimate=0.1, n_sim=50, n_points=50, cov=0.1)
+    level = samplers.methods.Level(gamma=1.0, p=0.1, estimate=0.1, n_sim=50, n_points=50, cov=0.1)
     cut = outcome(0.0, math.inf, Status.STOPPED, trace=(level,))
     result = combine([*ends, cut], 0.95)
     assert result.p == pytest.approx(1.5e-4)

@@ -106,6 +106,6 @@ def test_without_failures_of_one_the_text_has_a_bound():
 def test_a_comparison_comes_back_from_its_file(tmp_path):
     found = samplers.compare(NESTED[0], NESTED[1], seed=0, max_sim=3000)
     found.save(tmp_path / "comparison")
-    assert samplers.Comparison.load(tmp_path / "comparison") == found
+    assert samplers.comparison.Comparison.load(tmp_path / "comparison") == found
     assert "\n" not in repr(found)
     assert len(found.to_pandas()) == len(found.either.sample.f)

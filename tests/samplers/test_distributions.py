@@ -7,12 +7,13 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.distributions import OpenTurnsDistribution, ScipyDistribution, as_distribution
+from samplers.bases import OpenTurnsDistribution, ScipyDistribution, as_distribution
+from samplers.distributions import StandardNormal
 
 
-@pytest.mark.parametrize("base", ["us101", samplers.StandardNormal, stats.Normal, stats.gamma, [], [1.0], 3.0])
+@pytest.mark.parametrize("base", ["us101", StandardNormal, stats.Normal, stats.gamma, [], [1.0], 3.0])
 def test_other_things_are_refused(base):
-    hint = ": call it, with its parameters" if base in (samplers.StandardNormal, stats.Normal, stats.gamma) else ""
+    hint = ": call it, with its parameters" if base in (StandardNormal, stats.Normal, stats.gamma) else ""
     with pytest.raises(ValueError, match=rf"Expected a distribution of scipy\.stats with its parameters.*{hint}\.$"):
         as_distribution(base)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import samplers
+from samplers.distributions import NormalBlock, StandardNormal
 from samplers.limit_states import half_space
 from samplers.proposals import Gaussian
 from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal
@@ -49,8 +50,8 @@ def test_bad_arguments_are_refused_before_any_simulation(options, expected, reco
     ("problem", "expected"),
     [
         (lambda x: x, "FunctionProblem"),
-        (SimpleNamespace(dim=2, base=samplers.StandardNormal(2)), "dim, base and evaluate, got .* without evaluate"),
-        (SimpleNamespace(dim=0, base=samplers.StandardNormal(2), evaluate=len), "dim to be a whole number of at least"),
+        (SimpleNamespace(dim=2, base=StandardNormal(2)), "dim, base and evaluate, got .* without evaluate"),
+        (SimpleNamespace(dim=0, base=StandardNormal(2), evaluate=len), "dim to be a whole number of at least"),
         (SimpleNamespace(dim=2, base=np.random, evaluate=len), "problem.base to have sample, log_prob, .* got module"),
     ],
     ids=["a function", "no f", "no dimension", "no distribution"],
@@ -114,7 +115,7 @@ def test_stopped_by_a_callback(name, replicates, recorder):
         seen.append(progress.n_sim)
         return progress.n_sim >= 1000
 
-    method = samplers.MonteCarlo(batch=400) if name == "mc" else samplers.get_method(name)
+    method = samplers.MonteCarlo(batch=400) if name == "mc" else samplers.methods.get_method(name)
     result = samplers.estimate(
         samplers.FunctionProblem(f, 2), method, seed=1, max_sim=5000, replicates=replicates, stop=after_1000
     )
@@ -155,7 +156,7 @@ def test_the_further_run_repeats_with_the_seed_that_the_result_states():
 
 def test_what_cannot_search_under_a_mixture_is_left_to_two_stage_and_refits_that_cannot_be_mixed_are_told():
     class WithBlocks(FittedWithEnsemble):
-        blocks = (samplers.NormalBlock(Gaussian.standard(1)), samplers.NormalBlock(Gaussian.standard(1)))
+        blocks = (NormalBlock(Gaussian.standard(1)), NormalBlock(Gaussian.standard(1)))
 
     class Unmixed(FittedWithEnsemble):
         def ensemble(self):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import samplers
+from samplers.distributions import StandardNormal
 from samplers.evaluate import Evaluator
 from samplers.method import Interrupted, Outcome, Request, offer_of, request_gradients, request_terms
 from samplers.problem import EvaluationError, TermGradients, Terms
@@ -16,7 +17,7 @@ A = np.eye(2)
 
 
 def evaluator(f, on_error="failure"):
-    return Evaluator(SimpleNamespace(dim=2, base=samplers.StandardNormal(2), evaluate=f), on_error=on_error)
+    return Evaluator(SimpleNamespace(dim=2, base=StandardNormal(2), evaluate=f), on_error=on_error)
 
 
 def raises_at_two(x):
@@ -122,7 +123,7 @@ def test_f_can_write_on_its_points_and_set_errors_of_numpy():
 
 def test_a_problem_that_goes_on_by_itself_is_not_split():
     class Rowwise:
-        dim, base, sizes = 2, samplers.StandardNormal(2), []
+        dim, base, sizes = 2, StandardNormal(2), []
 
         def evaluate(self, x):
             raise AssertionError("its rows are asked for")
@@ -140,7 +141,7 @@ def test_a_problem_that_goes_on_by_itself_is_not_split():
 class Plain:
     """f is 1 everywhere, by the batch and by the row."""
 
-    dim, base = 2, samplers.StandardNormal(2)
+    dim, base = 2, StandardNormal(2)
 
     def evaluate(self, x):
         return np.ones(len(x))
@@ -181,7 +182,7 @@ def series(terms=lambda x: 2.0 - x, gradient=lambda x, term: -A[term], cost=2.5)
     return samplers.FunctionProblem(dim=2, terms=terms, gradient=gradient, gradient_cost=cost)
 
 
-class Asks(samplers.Method):
+class Asks(samplers.methods.Method):
     """Simulates base draws with their terms, then asks for some gradients, and goes on with plain points."""
 
     name, stops_at_target = "asks", False
@@ -288,7 +289,7 @@ def test_gradients_that_raise_are_missing_and_cost_the_most():
 class Given:
     """A problem that gives what it is told to."""
 
-    dim, base, gradient_cost = 2, samplers.StandardNormal(2), 1.0
+    dim, base, gradient_cost = 2, StandardNormal(2), 1.0
 
     def __init__(self, values=lambda x: x, cost=1.0):
         self.values, self.cost = values, cost

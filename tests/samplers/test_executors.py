@@ -58,18 +58,18 @@ def by(executor: Any, n: int = 100) -> samplers.Estimate:
 )
 def test_the_number_of_workers_changes_no_bit(name: str, workers: int) -> None:
     with open_executor(name, workers) as executor:
-        assert by(executor, 400) == by(samplers.InProcess(), 400)
+        assert by(executor, 400) == by(samplers.executors.InProcess(), 400)
 
 
 @pytest.mark.parametrize("name", [case(name, quick=name == "local") for name in EXECUTORS])
 def test_workers_that_are_killed_change_no_bit(name: str, tmp_path: Path) -> None:
     """One call in 20 ends its process by SIGKILL."""
     n = 30 if name == "local" else 70
-    seen: list[samplers.Progress] = []
+    seen: list[samplers.run.Progress] = []
     with open_executor(name) as executor:
         killed = problem(KillsItself(tmp_path, 20), chunk_size=2)
         result = estimate(killed, executor, n, progress=seen.append)
-    assert result == estimate(problem(chunk_size=2), samplers.InProcess(), n)
+    assert result == estimate(problem(chunk_size=2), samplers.executors.InProcess(), n)
     assert seen[-1].n_retries >= 1
     assert [each.n_sim for each in seen] == sorted(each.n_sim for each in seen)
 
@@ -182,7 +182,7 @@ def test_a_driver_that_is_killed_goes_on_under_another_executor(
     for each in (name, *others[:-1]):
         kill_in_mid_run(start_driver(tmp_path, each, n), tmp_path)
     assert start_driver(tmp_path, others[-1], n).wait(300) == 0, (tmp_path / "said").read_text()
-    whole = estimate(problem(), samplers.InProcess(), n)
+    whole = estimate(problem(), samplers.executors.InProcess(), n)
     assert (tmp_path / "printed").read_text().split() == [str(whole.p), str(whole.n_sim)]
 
 
@@ -210,7 +210,7 @@ def test_terms_and_gradients_come_from_workers_too() -> None:
     asked = samplers.FunctionProblem(
         dim=40, terms=lambda x: 3.5 - x @ normals.T, gradient=lambda x, term: -normals[term]
     )
-    whole = samplers.estimate(asked, seed=1, max_sim=1500, executor=samplers.InProcess())
+    whole = samplers.estimate(asked, seed=1, max_sim=1500, executor=samplers.executors.InProcess())
     assert whole.p > 0
     assert samplers.estimate(asked, seed=1, max_sim=1500, workers=2) == whole
 
@@ -232,7 +232,7 @@ def test_a_problem_that_cannot_be_sent_or_loaded_is_one_clear_line() -> None:
     broken = Unloadable()
     asked = samplers.FunctionProblem(lambda x: x[:, 0] + len(str(broken)), 2)
     with ThreadPoolExecutor(1) as threads:
-        with pytest.raises(samplers.ExecutorError, match="A worker process cannot load the problem"):
+        with pytest.raises(executors.ExecutorError, match="A worker process cannot load the problem"):
             samplers.estimate(asked, "mc", seed=1, max_sim=10, executor=threads)
 
 
@@ -249,7 +249,7 @@ class Jobs:
 
 
 def test_threads_and_jobs_give_the_bits_of_one_process() -> None:
-    expected = by(samplers.InProcess())
+    expected = by(samplers.executors.InProcess())
     with ThreadPoolExecutor(3) as threads:
         assert by(threads) == expected
         assert threads.submit(int, 7).result() == 7  # it is the caller's, and goes on
@@ -283,7 +283,7 @@ class Wrong:
     ],
 )
 def test_a_pool_that_answers_something_else_ends_the_run_in_one_line(answer: str, message: str) -> None:
-    with pytest.raises(samplers.ExecutorError, match=message) as refused:
+    with pytest.raises(executors.ExecutorError, match=message) as refused:
         by(FuturesPool(Wrong(answer), workers=2), 3000)
     assert "\n" not in str(refused.value)
 
@@ -339,7 +339,9 @@ def test_a_chunk_that_nobody_waits_for_is_cancelled_and_no_two_calls_are_alike(m
     monkeypatch.setattr(executors, "QUIET_SECONDS", 0.01)
     waiting = Waiting()
     with pytest.warns(RuntimeWarning, match="has come back"):
-        with pytest.raises(samplers.ExecutorError, match=r"No worker has computed anything: no answer within 0\.001 s"):
+        with pytest.raises(
+            executors.ExecutorError, match=r"No worker has computed anything: no answer within 0\.001 s"
+        ):
             estimate(problem(matrix), FuturesPool(waiting, workers=1, time_limit=0.001), 1)
     assert len(waiting.jobs) == 3 and all(job.cancelled() for job in waiting.jobs)
     (*first, call), (*again, other), _ = waiting.calls
@@ -401,7 +403,7 @@ def ray(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
 
 
 def test_tasks_give_the_bits_of_one_process(ray: FakeRay) -> None:
-    assert by(RayCluster(options={"num_gpus": 0})) == by(samplers.InProcess())
+    assert by(RayCluster(options={"num_gpus": 0})) == by(samplers.executors.InProcess())
     assert ray.options == {"num_cpus": 1, "max_retries": 0, "num_gpus": 0}
 
 
@@ -420,11 +422,11 @@ def test_a_cluster_that_is_gone_does_not_start_or_is_not_installed_is_one_line(
     ray: FakeRay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ray.gone = True
-    with pytest.raises(samplers.ExecutorError, match=r"does not answer any more \(ConnectionError: the head"):
+    with pytest.raises(executors.ExecutorError, match=r"does not answer any more \(ConnectionError: the head"):
         estimate(problem(), "ray", 60)
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     for address, said in ((None, "Ray does not start"), ("a:1", "No Ray cluster answers at 'a:1'")):
-        with pytest.raises(samplers.ExecutorError) as refused:
+        with pytest.raises(executors.ExecutorError) as refused:
             estimate(problem(), RayCluster(address), 10)
         assert str(refused.value) == f"{said} (OSError: The current node timed out during startup. See the logs.)."
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -467,7 +469,7 @@ def drawing_problem() -> Any:
 
 def test_what_a_simulation_draws_follows_from_the_seed_and_its_chunk() -> None:
     with drawing_problem() as drawing:
-        first = estimate(drawing, samplers.InProcess(), 100, keep_points=True)
+        first = estimate(drawing, samplers.executors.InProcess(), 100, keep_points=True)
         with ThreadPoolExecutor(1) as threads:
             again = estimate(drawing, threads, 100, keep_points=True)
     assert first.points is not None and again.points is not None

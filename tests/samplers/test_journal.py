@@ -358,7 +358,7 @@ def test_the_wall_time_of_all_parts_adds_up(tmp_path: Path, monkeypatch: pytest.
 class Series:
     """Two half-spaces in 40 dimensions; it counts what it is asked for, and is interrupted at a certain request."""
 
-    dim, gradient_cost, base = 40, 3.0, samplers.StandardNormal(40)
+    dim, gradient_cost, base = 40, 3.0, samplers.distributions.StandardNormal(40)
     normals = np.linalg.qr(np.random.default_rng(0).standard_normal((40, 2)))[0].T
 
     def __init__(self, last: int = 10**6, shift: float = 0.0) -> None:

@@ -18,7 +18,7 @@ def test_dim_must_be_a_positive_whole_number(dim):
     with pytest.raises(ValueError, match="whole number of at least 1"):
         samplers.FunctionProblem(lambda x: x[:, 0], dim)
     with pytest.raises(ValueError, match="whole number of at least 1"):
-        samplers.StandardNormal(dim)
+        samplers.distributions.StandardNormal(dim)
 
 
 @pytest.mark.parametrize("x", [np.zeros(2), np.zeros((3, 1)), np.zeros((1, 3, 2))])

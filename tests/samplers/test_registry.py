@@ -34,10 +34,10 @@ LATTICE = """
             n = min(self.n, goal.budget)
             f = yield inputs.base.sample(n, rng)
             hits = int((f <= goal.gamma).sum())
-            level = samplers.Level(
+            level = samplers.methods.Level(
                 gamma=goal.gamma, p=hits / n, estimate=hits / n, n_sim=n, n_points=n, cov=binomial_cov(hits / n, n)
             )
-            return samplers.Outcome.of_counts(hits, n, goal.confidence, (level,))
+            return samplers.methods.Outcome.of_counts(hits, n, goal.confidence, (level,))
 
 
     class Nameless:

@@ -252,19 +252,19 @@ def test_a_file_that_was_cut_or_changed_is_refused_in_one_line(tmp_path, change)
 def test_a_file_of_something_else_is_refused(tmp_path):
     write_object(tmp_path / "thing", Thing(1))
     with pytest.raises(ValueError, match="got Thing"):
-        read_object(tmp_path / "thing", samplers.Level)
+        read_object(tmp_path / "thing", samplers.methods.Level)
     with pytest.raises(FileNotFoundError, match="no file"):
         read_object(tmp_path / "nothing", Thing)
     with pytest.raises(OSError, match=r"Cannot write '.*': "):
         write_object(tmp_path, Thing(1))  # a folder
 
 
-class Other(samplers.Method):
+class Other(samplers.methods.Method):
     name, stops_at_target = "other", False
 
     def steps(self, inputs, goal, rng):
         f = yield inputs.base.sample(100, rng)
-        return samplers.Outcome.of_counts(int((f <= goal.gamma).sum()), 100, goal.confidence, trace=())
+        return samplers.methods.Outcome.of_counts(int((f <= goal.gamma).sum()), 100, goal.confidence, trace=())
 
 
 def test_a_method_of_another_package_keeps_its_name(tmp_path):

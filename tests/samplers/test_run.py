@@ -26,7 +26,7 @@ EASY = half_space(2, 2.0).problem
 class Places:
     """What `start` needs of a problem: no f."""
 
-    dim, base = 2, samplers.StandardNormal(2)
+    dim, base = 2, samplers.distributions.StandardNormal(2)
 
 
 def finished(run, f=EASY.f):
@@ -40,7 +40,7 @@ ALL = {"gamma": 0.5, "target_cov": 0.2, "confidence": 0.8, "on_error": "bound"}
 
 @pytest.mark.parametrize(("method", "more"), [("mc", ALL), ("mc", {}), ("ce", {}), ("adss", {}), ("two-stage", {})])
 def test_gives_what_estimate_gives(method, more):
-    chosen, options = samplers.get_method(method), {"seed": 3, "replicates": 3, "max_sim": 4501, **more}
+    chosen, options = samplers.methods.get_method(method), {"seed": 3, "replicates": 3, "max_sim": 4501, **more}
     assert finished(chosen.start(Places(), **options)) == samplers.estimate(EASY, chosen, **options)
 
 
@@ -78,7 +78,7 @@ def test_progress_and_a_result_at_any_moment():
     assert run.result() == result
 
 
-class Asks(samplers.Method):
+class Asks(samplers.methods.Method):
     """Asks for points three times; goes on when it is interrupted, or does not know of it; returns no outcome."""
 
     name, stops_at_target = "asks", False
@@ -88,7 +88,7 @@ class Asks(samplers.Method):
 
     def steps(self, inputs, goal, rng):
         for _ in range(3):
-            with contextlib.suppress(*[samplers.Interrupted] * self.goes_on):
+            with contextlib.suppress(*[samplers.methods.Interrupted] * self.goes_on):
                 yield self.points
 
 
@@ -113,7 +113,7 @@ def test_a_method_must_ask_for_points_and_return_an_outcome():
 @pytest.mark.parametrize(("method", "max_sim"), [("adss", None), ("mc", 6000), ("two-stage", 6000)])
 def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recorder, drive):
     alone, together = (recorder(half_space(3, 3.0).problem.f) for _ in range(2))
-    chosen, problem = samplers.get_method(method), samplers.FunctionProblem(alone, 3)
+    chosen, problem = samplers.methods.get_method(method), samplers.FunctionProblem(alone, 3)
     goal = Goal(gamma=0.0, max_sim=max_sim and max_sim // 3)
     rngs = [np.random.default_rng(np.random.SeedSequence(7, spawn_key=(i,))) for i in range(3)]
     expected = combine([drive(chosen.steps(problem, goal, rng), problem).value for rng in rngs], 0.95)
@@ -236,13 +236,13 @@ def test_before_the_first_batch_there_is_nothing_to_know() -> None:
 
 
 def test_a_signal_while_the_method_computes_waits_until_it_can_conclude(monkeypatch: pytest.MonkeyPatch) -> None:
-    take = samplers.Run.answer
+    take = samplers.run.Run.answer
 
-    def answer(self: samplers.Run, answers: Sequence[Answer]) -> None:
+    def answer(self: samplers.run.Run, answers: Sequence[Answer]) -> None:
         os.kill(os.getpid(), signal.SIGINT)
         take(self, answers)
 
-    monkeypatch.setattr(samplers.Run, "answer", answer)
+    monkeypatch.setattr(samplers.run.Run, "answer", answer)
     with pytest.raises(EstimationInterrupted) as caught:
         samplers.estimate(EASY, "mc", seed=1, max_sim=20_000)
     assert caught.value.estimate.n_sim == 10_000

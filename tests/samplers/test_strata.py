@@ -11,13 +11,14 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 import samplers
-from samplers import FunctionProblem, StratifiedProblem, Stratum
+from samplers import FunctionProblem
 from samplers.analysis import compute_exceedance, expect_over_failures, weigh_failures
 from samplers.method import Outcome, Part
 from samplers.problem import StandardNormal, read_strata
 from samplers.proposals import Gaussian
 from samplers.replicate import sum_strata
 from samplers.sample import Sample, Status, bound_missed
+from samplers.strata import StratifiedProblem, Stratum
 from samplers.testing import check_base
 
 
@@ -265,7 +266,7 @@ def test_a_stratum_that_a_replicate_has_not_simulated_does_not_count_in_it():
 def test_a_plan_takes_plain_draws_by_stratum():
     """Neyman: n = (sum of w_k sqrt(p_k (1 - p_k)))^2 / (p t)^2."""
     result = samplers.estimate(even((0.9, 0.1), (40.0, 1.0)), "mc", seed=0, max_sim=4000)
-    (run,) = samplers.plan_runs(result.pilot(), target_cov=0.1)
+    (run,) = samplers.plan(result.pilot(), target_cov=0.1)
     p = result.parts[1].p
     assert run.n_sim == math.ceil((1 - p) / p / 0.01)
 
@@ -594,7 +595,7 @@ def test_a_lucky_draw_of_a_pilot_is_not_the_estimate() -> None:
     assert 2e-5 < part.p < 4e-5 and part.interval[0] < 3e-5 < 1e-3 < part.interval[1]
 
 
-class Misled(samplers.Method):
+class Misled(samplers.methods.Method):
     """A search whose 100 base draws none fail, and whose 500 others find p = 1e-11 with a c.o.v. of 0.12."""
 
     name, stops_at_target = "misled", True

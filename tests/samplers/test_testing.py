@@ -34,7 +34,7 @@ class Plain:
         while len(f) < n:
             try:
                 f = np.append(f, (yield inputs.base.sample(min(500, n - len(f)), rng)))
-            except samplers.Interrupted:
+            except samplers.methods.Interrupted:
                 if self.fault == "cannot be interrupted":
                     raise
                 status = samplers.Status.STOPPED
@@ -42,7 +42,7 @@ class Plain:
         hits = int(np.count_nonzero(f < goal.gamma if self.fault == "strict" else f <= goal.gamma))
         if self.fault == "chokes on infinity" and not np.isfinite(f).all():
             raise FloatingPointError("overflow")
-        trace = samplers.Level(
+        trace = samplers.methods.Level(
             gamma=goal.gamma, p=hits / len(f), estimate=hits / len(f), n_points=len(f), cov=0.1,
             n_sim=len(f) - (self.fault == "hides a simulation"),
         )  # fmt: skip
@@ -50,7 +50,7 @@ class Plain:
         interval = clopper_pearson(hits, len(f), 0.95)
         if self.fault == "too sure":
             interval = (p, p)
-        return samplers.Outcome(
+        return samplers.methods.Outcome(
             p=p,
             interval=(min(p, interval[0]), max(p, interval[1])),
             cov=binomial_cov(hits / len(f), len(f)),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from samplers.methods.blocks import BetaBlock, NormalBlock, Product, announced_blocks
+from samplers.distributions import BetaBlock, NormalBlock, Product, announced_blocks
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import effective_sample_size, normalise_weights
 

@@ -34,7 +34,7 @@ from benchmarks.papers.okelly2018.search import (
 )
 from benchmarks.run_lines import RunLines, drop_torn_line
 from benchmarks.samplers.runs import map_jobs
-from samplers.methods.blocks import Product
+from samplers.distributions import Product
 from samplers.problem import FloatArray
 
 OWN_FILE = "own.jsonl"

@@ -17,12 +17,11 @@ from samplers import (
     ImportanceSampling,
     ImprovedCrossEntropy,
     MonteCarlo,
-    Stepping,
     SubsetSimulation,
     TwoStage,
     estimate,
 )
-from samplers.method import whole_simulations
+from samplers.method import Stepping, whole_simulations
 
 TRAFFIC_BASE = "highway"
 """Base distribution: assembled from published statistics of German motorways; the paper's mixtures are not public."""

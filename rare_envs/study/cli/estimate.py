@@ -25,7 +25,8 @@ from rare_envs.study.cli import shell
 from rare_envs.study.cli.shell import DOUBTFUL, Answer, command, describe_report, option_of
 
 if TYPE_CHECKING:
-    from samplers import Estimate, Executor
+    from samplers import Estimate
+    from samplers.executors import Executor
 
 NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
@@ -134,7 +135,7 @@ def estimate_highway_env(
         raise BadInput(f"There is a finished run in {str(out)!r} ({ESTIMATE_FILE}): replace it by --force.")
     names = ("gamma", "seed", "max_sim", "target_cov", "replicates", "on_error")
     with as_bad_input(ValueError, OSError, TypeError):
-        method = samplers.get_method(question.method)
+        method = samplers.methods.get_method(question.method)
         arguments = {name: getattr(question.run_arguments, name) for name in names}
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         settings: dict[str, Any] = {"config": config}

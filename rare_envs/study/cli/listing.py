@@ -90,7 +90,7 @@ def list_names() -> dict[str, Any]:
         "environments": environments,
         "highway_env": list(HIGHWAY_ENV_IDS),
         "weather": [_describe(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
-        "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
+        "methods": {name: _first_line(method) for name, method in samplers.methods.METHODS.items()},
         "egos": EGOS,
         "drivers": DRIVERS,
         "measures": {name: _first_line(measure) for name, measure in measures.items()},

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from samplers.bases import Gaussian
 from samplers.components import (
     IsotropicNormal,
     LiftedComponent,
@@ -24,7 +25,6 @@ from samplers.components import (
     mixture_log_ratio,
     posterior,
 )
-from samplers.distributions import Gaussian
 from samplers.methods.base import SimulationSteps
 from samplers.methods.series import LAW, ROUNDS, WALKS
 from samplers.methods.series.walks import TermSimulator, Walks, join_terms

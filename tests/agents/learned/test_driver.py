@@ -27,7 +27,7 @@ from rare_envs.sensors.lidar import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import bicycle
-from samplers.methods.blocks import announced_blocks
+from samplers.distributions import announced_blocks
 from tests.agents.learned.test_collision_avoidance import seen
 
 

@@ -52,7 +52,7 @@ from rare_envs.simulation import drive
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 from samplers import FunctionProblem
-from samplers.methods.blocks import BetaBlock, NormalBlock, Product
+from samplers.distributions import BetaBlock, NormalBlock, Product
 from samplers.proposals import Gaussian
 
 TINY = StudyScale(naive=1000, iterations=2, draws=300, final=300, own=0, chunk=100)

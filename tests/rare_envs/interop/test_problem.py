@@ -23,7 +23,7 @@ FAST = {"vehicles_count": 3, "duration": 4}
 IDLE = Always(1)
 
 
-def fast(ego: Any = IDLE, **kwargs: Any) -> rare_envs.HighwayEnvProblem:
+def fast(ego: Any = IDLE, **kwargs: Any) -> rare_envs.interop.HighwayEnvProblem:
     return rare_envs.highway_env_problem("highway-fast-v0", ego=ego, config=FAST, vehicles=2, **kwargs)
 
 
@@ -56,7 +56,7 @@ TRUTH_CONFIG = {
 _FACTOR = float(np.exp(-1 / 8)) / 1.65
 
 
-def truth_problem(**kwargs: Any) -> rare_envs.HighwayEnvProblem:
+def truth_problem(**kwargs: Any) -> rare_envs.interop.HighwayEnvProblem:
     return rare_envs.highway_env_problem(
         "highway-fast-v0", ego=IDLE, config=TRUTH_CONFIG, fixed="highway_env", **kwargs
     )

@@ -41,7 +41,7 @@ def test_the_ego_starts_in_the_third_lane_and_everybody_has_one():
 
 def test_cross_entropy_finds_the_blocks():
     """24 Beta, 404 Normal in the box, and noise that stays: 428 and more dimensions."""
-    from samplers.methods.blocks import announced_blocks
+    from samplers.distributions import announced_blocks
 
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", **SHORT)
     blocks = announced_blocks(problem)

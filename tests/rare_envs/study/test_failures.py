@@ -120,7 +120,7 @@ class Forgetful:
 def make_report(ego: object, max_sim: int, gamma: float = 0.0) -> Report:
     problem = rare_envs.DrivingProblem(CUT_IN, ego=ego)
     estimate = samplers.estimate(problem, "mc", max_sim=max_sim, gamma=gamma, seed=0)
-    study = Study(Question(env_id=CUT_IN, gamma=gamma, method="mc"), problem, samplers.get_method("mc"))
+    study = Study(Question(env_id=CUT_IN, gamma=gamma, method="mc"), problem, samplers.methods.get_method("mc"))
     estimate, kinds = classify_failures(problem, estimate)
     return Report(study, estimate, 1.0, kinds=kinds)
 
@@ -177,7 +177,7 @@ def estimate_of(x: np.ndarray, gamma: float = 0.0) -> samplers.Estimate:
     f = np.concatenate([np.full(len(x), -1.0), np.full(9 * len(x), 5.0)])
     problem = samplers.FunctionProblem(lambda u: np.ones(len(u)), 3)
     run = samplers.estimate(problem, "mc", max_sim=100, seed=0)
-    return replace(run, p=0.1, cov=(9 / len(f)) ** 0.5, sample=samplers.Sample.of_equal_draws(f, x))
+    return replace(run, p=0.1, cov=(9 / len(f)) ** 0.5, sample=samplers.methods.Sample.of_equal_draws(f, x))
 
 
 def test_a_coasting_ego_hits_at_half_the_closing_speed() -> None:

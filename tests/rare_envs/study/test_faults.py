@@ -298,7 +298,7 @@ def test_whatever_the_ego_does_the_answer_is_that_of_one_that_gives_nan(
     expected = evaluate.run(prepare(ask("nan", risky)))
     assert 1 <= len(expected.faults) <= 8
     seen: list[Progress] = []
-    executor = samplers.LocalProcesses(2, time_limit=5.0, memory_limit=2.0**30)
+    executor = samplers.executors.LocalProcesses(2, time_limit=5.0, memory_limit=2.0**30)
     report = evaluate.run(prepare(ask(ego, risky)), seen.append, executor=executor)
     assert report.estimate == expected.estimate
     assert fault_rows(report) == fault_rows(expected)
@@ -326,7 +326,7 @@ def test_what_one_executor_began_another_continues(
         with pytest.raises(evaluate.RunInterrupted, match="200 simulations are kept"):
             evaluate.run_into(faulty / "run", prepare(ask("nan", risky, chunk=chunk)))
     assert (faulty / "run" / JOURNAL).exists()
-    report = evaluate.resume(faulty / "run", executor=samplers.LocalProcesses(1))
+    report = evaluate.resume(faulty / "run", executor=samplers.executors.LocalProcesses(1))
     assert report.estimate == whole.estimate
     assert fault_rows(report) == fault_rows(whole)
 
@@ -338,7 +338,7 @@ def test_a_worker_that_cannot_load_the_ego_is_one_line(faulty: Path, risky: str)
 
         def open(self, compute: Any) -> Any:
             (faulty / "faulty.py").write_text(FAULTY + "# changed")
-            return samplers.LocalProcesses(1).open(compute)
+            return samplers.executors.LocalProcesses(1).open(compute)
 
     with pytest.raises(BadInput, match=r"A worker process cannot load the problem .* not the file"):
         evaluate.run(prepare(ask("nan", risky)), executor=Later())

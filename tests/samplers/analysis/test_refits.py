@@ -68,7 +68,7 @@ def test_the_decision_needs_points_and_an_ensemble():
     assert needs_ensemble_run(result)
     assert not needs_ensemble_run(replace(result, sample=None))
     assert not needs_ensemble_run(run(fitted(far)))  # no ensemble
-    assert not needs_ensemble_run(run(samplers.StandardNormal(2)))
+    assert not needs_ensemble_run(run(samplers.distributions.StandardNormal(2)))
     nothing_failed = samplers.estimate(HalfSpace(fitted(far, FittedWithEnsemble), 9.0), "mc", seed=1, max_sim=100)
     assert not needs_ensemble_run(nothing_failed)
 

@@ -65,7 +65,7 @@ def test_of_plain_draws_the_spread_is_that_of_the_ratios():
 @pytest.mark.parametrize("method", ["adss", "ce", "mc", "two-stage"])
 def test_the_same_base_gives_the_same_p(method):
     result = run(method)
-    again = result.reweight(samplers.StandardNormal(2))
+    again = result.reweight(samplers.distributions.StandardNormal(2))
     assert again.p == pytest.approx(result.p)
     assert again.ratio == pytest.approx(1)
     # Reweighting takes draws as independent; those of two-stage are stratified, and spread less.

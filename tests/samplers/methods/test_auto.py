@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import chi2, norm
 
 import samplers
+from samplers.executors import InProcess
 from samplers.limit_states import half_space
 
 
@@ -37,7 +38,7 @@ def test_few_simulations_in_many_dimensions_are_for_subset_simulation(dim, max_s
 def test_noise_does_not_count_as_dimensions_and_slow_simulations_are_few(seconds, max_sim, name):
     """Two coordinates are searched, 100 are noise; failures are common, so that nothing is to be learned."""
 
-    class Base(samplers.StandardNormal):
+    class Base(samplers.distributions.StandardNormal):
         noise = np.arange(102) >= 2
 
     problem = samplers.FunctionProblem(lambda x: 0.5 - x[:, 0], base=Base(102), dim=102)
@@ -107,11 +108,11 @@ def test_a_run_goes_on_from_its_journal_in_chunks_and_by_ask_and_tell(tmp_path, 
     first = samplers.estimate(problem, seed=4, max_sim=300, journal=tmp_path / "journal")
     assert (first.method.name, f.rows) == ("surrogate", 300)
     assert first.p == samplers.estimate(problem, "surrogate", seed=4, max_sim=300).p
-    again = samplers.estimate(problem, seed=4, max_sim=300, journal=tmp_path / "journal", executor=samplers.InProcess())
+    again = samplers.estimate(problem, seed=4, max_sim=300, journal=tmp_path / "journal", executor=InProcess())
     assert again == first and again.choice == first.choice != ""
     assert f.rows < 630  # the journal compares a few rows with f
     run = samplers.Auto().start(problem, seed=4, max_sim=300)
     while not run.done:
         run.tell(problem.evaluate(run.ask()))
     assert run.result() == first
-    assert samplers.plan_runs(first.pilot(), target_cov=first.cov / 2)[0].method == "surrogate"
+    assert samplers.plan(first.pilot(), target_cov=first.cov / 2)[0].method == "surrogate"

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.distributions import GaussianBlock, MixtureBlock, Product
 from samplers.limit_states import four_branches, half_space, parabola, two_modes
-from samplers.methods.blocks import GaussianBlock, MixtureBlock, Product
 from samplers.proposals import Gaussian
 
 CE = samplers.CrossEntropy

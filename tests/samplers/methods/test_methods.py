@@ -25,13 +25,13 @@ WHOLE = [pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name 
 
 @pytest.fixture(params=WHOLE)
 def method(request):
-    return samplers.get_method(request.param)
+    return samplers.methods.get_method(request.param)
 
 
 @pytest.mark.parametrize("name", METHODS.own)
 def test_our_own_are_frozen_documented_dataclasses_that_can_be_asked(name):
-    method = samplers.get_method(name)
-    assert isinstance(method, samplers.Method)
+    method = samplers.methods.get_method(name)
+    assert isinstance(method, samplers.methods.Method)
     with pytest.raises(dataclasses.FrozenInstanceError):
         method.name = "other"
     for field in dataclasses.fields(method):
@@ -66,7 +66,7 @@ def test_does_what_every_method_must_do(method, check):
 @pytest.mark.parametrize("name", ["mc", "is", "ce", "ice", "adss", "two-stage"])
 @pytest.mark.parametrize("check", [check_budget, check_interruption])
 def test_budgets_and_interruptions_of_quick_methods(name, check):
-    check(samplers.get_method(name))
+    check(samplers.methods.get_method(name))
 
 
 @pytest.mark.parametrize("name", ALL)

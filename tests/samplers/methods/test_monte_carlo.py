@@ -12,7 +12,7 @@ from samplers.method import Goal, KeptDraws
 def test_draws_from_the_base_itself():
     """Its points come from base.sample: a base needs no map from standard normal space."""
 
-    class Base(samplers.StandardNormal):
+    class Base(samplers.distributions.StandardNormal):
         def from_standard_normal(self, u):
             raise NotImplementedError  # as a base says that it has no map
 

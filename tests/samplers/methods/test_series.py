@@ -60,7 +60,7 @@ def test_series_systems_of_half_spaces(dim, p, seeds):
 class EarlyAndLate:
     """One car, two ways to hit it: early along one axis, late along another, told apart by the tick alone."""
 
-    dim, base, gradient_cost = 300, samplers.StandardNormal(300), 2.0
+    dim, base, gradient_cost = 300, samplers.distributions.StandardNormal(300), 2.0
     beta = np.array([3.7, 3.9])
 
     def terms(self, x, gamma=0.0):

@@ -39,7 +39,7 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
     shown = cli("list", "all").stdout
     entries = json.loads(cli("list", "--json").stdout)
     assert list(entries["environments"]) == list(SCENARIOS)
-    assert list(entries["methods"]) == list(samplers.METHODS)
+    assert list(entries["methods"]) == list(samplers.methods.METHODS)
     for env_id, environment in entries["environments"].items():
         space = rare_envs.DrivingProblem(env_id).space
         assert environment["vehicles"] == rare_envs.parallel_env(env_id).possible_agents
@@ -55,7 +55,14 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
         assert environment["kinematics_id"] in gym.registry
     assert all(name in gym.registry for name in entries["highway_env"])
     assert "weights (404 values), noise (1,020 values)" in " ".join(shown.split())
-    for name in (*SCENARIOS, *samplers.METHODS, "us101", *agents.files.SHIPPED_DRIVERS, "okelly2018", "lidar_ttc"):
+    for name in (
+        *SCENARIOS,
+        *samplers.methods.METHODS,
+        "us101",
+        *agents.files.SHIPPED_DRIVERS,
+        "okelly2018",
+        "lidar_ttc",
+    ):
         assert name in shown
 
 

@@ -24,6 +24,7 @@ from rare_envs.study.arguments import GATE_CODES, ExecutorOptions
 from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.estimate import ESTIMATE_FILE
 from rare_envs.study.run_folder import CRASH, read_failures
+from samplers.executors import LocalProcesses
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 
@@ -121,10 +122,10 @@ def test_a_plan_from_pilots_and_one_from_a_folder(
 
 
 def test_options_name_an_executor() -> None:
-    assert ExecutorOptions(workers=3, memory_limit=2.0).make() == samplers.LocalProcesses(3, memory_limit=2.0**31)
-    assert ExecutorOptions(executor="local").make() == samplers.LocalProcesses()
+    assert ExecutorOptions(workers=3, memory_limit=2.0).make() == LocalProcesses(3, memory_limit=2.0**31)
+    assert ExecutorOptions(executor="local").make() == LocalProcesses()
     ray = ExecutorOptions(executor="ray", address="auto", time_limit=9.0, memory_limit=1.0)
-    assert ray.make() == samplers.RayCluster("auto", time_limit=9.0, memory_limit=2.0**30)
+    assert ray.make() == samplers.executors.RayCluster("auto", time_limit=9.0, memory_limit=2.0**30)
 
 
 def commands(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

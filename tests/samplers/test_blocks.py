@@ -8,9 +8,9 @@ import pytest
 from scipy import integrate, optimize, stats
 
 import samplers
-from samplers import Distribution
-from samplers.methods.blocks import (
+from samplers.distributions import (
     BetaBlock,
+    Distribution,
     NormalBlock,
     Product,
     announced_blocks,
