@@ -14,7 +14,7 @@ from rare_envs.egos.needs import EgoNeeds
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import check_name, did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
-from rare_envs.scenarios.registry import SCENARIOS, find_scenario
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario, split_layout
 from rare_envs.sensors.camera import find_camera
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.observation import read_kinds
@@ -84,7 +84,12 @@ def set_up(
     Returns:
         The world and the space of its parameters.
     """
-    scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
+    if isinstance(scenario, str):
+        env_id, layout = split_layout(scenario)
+        if layout:
+            told = " and ".join(f"{name} {value!r}" for name, value in layout.items())
+            raise ValueError(f"{scenario!r} is for gym.make and gym.make_vec; here take {env_id!r} with {told}.")
+        scenario = find_scenario(env_id)
     refuse_unknown(scenario, unknown)
     kinds = read_kinds(observation)
     check_name("action", action, ACTIONS)

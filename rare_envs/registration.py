@@ -11,8 +11,7 @@ from gymnasium.vector import VectorEnv
 from rare_envs.scenarios.registry import (
     HIGHWAY_ENV_LAYOUT,
     SCENARIOS,
-    complete_id,
-    find_scenario,
+    env_id_of,
     kinematics_id,
     split_layout,
 )
@@ -53,8 +52,8 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
 
     Example:
         >>> import dataclasses
-        >>> from rare_envs.scenarios import scenario_named
-        >>> register_scenario("docs/LongCutIn-v0", dataclasses.replace(scenario_named("cut_in"), horizon=20.0))
+        >>> from rare_envs.scenarios import find_scenario
+        >>> register_scenario("docs/LongCutIn-v0", dataclasses.replace(find_scenario("cut_in"), horizon=20.0))
         >>> gym.make("docs/LongCutIn-v0").unwrapped.world.clock.seconds
         20.0
         >>> del SCENARIOS["docs/LongCutIn-v0"]
@@ -89,7 +88,7 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
     """
     from rare_envs.envs.parallel import DrivingParallelEnv
 
-    env_id, layout = split_layout(env_id)
+    env_id, layout = split_layout(env_id_of(env_id))
     return DrivingParallelEnv(env_id, **{**layout, **kwargs})
 
 
@@ -141,5 +140,4 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
     Raises:
         ValueError: If the id or an argument is unknown.
     """
-    find_scenario(split_layout(env_id)[0])
-    return gym.make_vec(complete_id(env_id), num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+    return gym.make_vec(env_id_of(env_id), num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)

@@ -187,11 +187,9 @@ def train_ego(
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
         raise ValueError(f"Expected a seed from 0 to 2^32 - 1, got {seed}.")
-    from rare_envs.scenarios.registry import find_scenario
+    from rare_envs.scenarios.registry import env_id_of
 
-    ids = (env_id,) if isinstance(env_id, str) else tuple(env_id)
-    for each in ids:
-        find_scenario(each)
+    ids = tuple(map(env_id_of, (env_id,) if isinstance(env_id, str) else env_id))
     if not ids or len(set(ids)) < len(ids) or (retraining is not None and len(ids) > 1):
         which = "one environment to train on in" if retraining else "different environments, one or more"
         raise ValueError(f"Expected {which}, got {', '.join(ids) or 'none'}.")

@@ -25,7 +25,7 @@ from benchmarks.uncertainty.base_coverage import Repetition, compare_with_truth,
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from samplers.problem import FloatArray
 from training.fit.base import fit_base
 from training.fit.filters import EventSet
@@ -58,7 +58,7 @@ class RecipeWorld:
 
     def truth(self) -> TruncatedGaussianMixture:
         """Return the distribution of the events."""
-        base = load_base(scenario_named(SCENARIO), self.base)
+        base = load_base(find_scenario(SCENARIO), self.base)
         assert isinstance(base, FittedDistribution) and isinstance(base.distribution, TruncatedGaussianMixture)
         return merge_components(base.distribution) if self.components == 1 else base.distribution
 

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from rare_envs.plugins import make_lazy_getattr
-from rare_envs.scenarios.registry import SCENARIOS, find_scenario, scenario_named
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 
 if TYPE_CHECKING:
     from rare_envs.distributions.space import Parameter
@@ -28,7 +28,6 @@ __all__ = [
     "i80",
     "keep_straight",
     "load_base",
-    "scenario_named",
     "straight",
 ]
 

@@ -62,8 +62,8 @@ class Scenario:
         ValueError: If it contradicts itself.
 
     Example:
-        >>> from rare_envs.scenarios import scenario_named
-        >>> cut_in = scenario_named("cut_in")
+        >>> from rare_envs.scenarios import find_scenario
+        >>> cut_in = find_scenario("cut_in")
         >>> cut_in.vehicle_names, cut_in.labels
         (('ego', 'cutter', 'lead'), ('the ego', 'the cutter', 'the lead'))
         >>> state = cut_in.initial(torch.tensor([[20.0, 15.0, 25.0, 10.0, 50.0, 3.5, 4.0, *[0.0] * 6]]))
@@ -230,8 +230,8 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
         ValueError: There is no such file, or it does not fit the scenario.
 
     Example:
-        >>> from rare_envs.scenarios import scenario_named
-        >>> load_base(scenario_named("car_following"), "us101").dim
+        >>> from rare_envs.scenarios import find_scenario
+        >>> load_base(find_scenario("car_following"), "us101").dim
         3
     """
     base = scenario.default_base if base is None else base

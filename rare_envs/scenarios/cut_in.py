@@ -151,9 +151,9 @@ class CutInTheta(NamedTuple):
     """Columns of theta in `CutIn-v1`, (B,) each: parameters, and behind them the script's memory.
 
     Example:
-        >>> from rare_envs.scenarios import scenario_named
+        >>> from rare_envs.scenarios import find_scenario
         >>> x = torch.tensor([[20.0, 20.0, 20.0, -3.0, 50.0, 3.5, 4.0, *6 * [0.0]]])  # the cutter beside the ego
-        >>> CutInTheta(*scenario_named("cut_in").initial(x).theta.unbind(1)).length.tolist()
+        >>> CutInTheta(*find_scenario("cut_in").initial(x).theta.unbind(1)).length.tolist()
         [80.0]
     """
 

@@ -34,75 +34,53 @@ SCENARIOS = Registry(
 )
 
 
-def scenario_named(name: str) -> Scenario:
-    """Return the scenario of a short name, such as "cut_in", in its newest version, or of an id.
-
-    Raises:
-        ValueError: If there is none; the message suggests the nearest name and lists all.
-
-    Example:
-        >>> scenario_named("cut_in").vehicle_names
-        ('ego', 'cutter', 'lead')
-    """
-    return SCENARIOS[env_id_of(name)]
-
-
-def env_id_of(name: str) -> str:
-    """Return the environment id of a scenario's short name, first registered, in its newest version, or of an id."""
-    name = complete_id(name)
-    if name in SCENARIOS:
-        return name
-    ids: dict[str, str] = {}
-    for env_id, scenario in SCENARIOS.items():
-        family, version = split_version(env_id)
-        known, earlier = split_version(ids.setdefault(scenario.name, env_id))
-        if known == family and (earlier or 0) < (version or 0):
-            ids[scenario.name] = env_id
-    if name not in ids:
-        hint = did_you_mean(name.rpartition("/")[2].lower(), ids)
-        raise ValueError(f"Unknown scenario {name!r}{hint}; there are {', '.join(ids)}.")
-    return ids[name]
-
-
-def split_version(env_id: str) -> tuple[str, int | None]:
-    """Return an id without its version, and the version; None where it has none."""
-    found = re.fullmatch(r"(.*)[-_]v(\d+)", env_id)
-    return (found[1], int(found[2])) if found else (env_id, None)
-
-
-def find_scenario(env_id: str) -> Scenario:
-    """Return the scenario of an environment id.
-
-    Args:
-        env_id: For example "rare_envs/CutIn-v0", or "CutIn-v0"; "module:my_namespace/Overtaking-v0", as for `gym.make`,
-            imports first the module that registers it.
+def find_scenario(name: str) -> Scenario:
+    """Return the scenario of a name, in any spelling of `env_id_of`, with HighwayEnv's layout or without.
 
     Raises:
         ValueError: If there is none; the message suggests the nearest id and lists all.
 
     Example:
-        >>> find_scenario("rare_envs/HardBrake-v0").name
-        'hard_brake'
+        >>> find_scenario("cut_in").vehicle_names
+        ('ego', 'cutter', 'lead')
     """
-    module, _, name = env_id.rpartition(":") if isinstance(env_id, str) else ("", "", env_id)
+    return SCENARIOS[split_layout(env_id_of(name))[0].rpartition(":")[2]]
+
+
+def env_id_of(name: str) -> str:
+    """Return the environment id that a name means, see `complete_id`.
+
+    Args:
+        name: For example "cut_in", "CutIn-v0" or "rare_envs/CutIn-v0"; "module:my_namespace/Overtaking-v0", as for
+            `gym.make`, imports first the module that registers it.
+
+    Raises:
+        ValueError: If there is none; the message suggests the nearest id and lists all.
+
+    Example:
+        >>> env_id_of("cut_in"), env_id_of("hard-brake")
+        ('rare_envs/CutIn-v1', 'rare_envs/HardBrake-v0')
+    """
+    module = name.rpartition(":")[0] if isinstance(name, str) else ""
     if module:
-        import_module(module, f"the environment {env_id!r}")
-    name = complete_id(name)
-    if isinstance(name, str) and name in SCENARIOS:
-        return SCENARIOS[name]
-    layouts = {kinematics_id(each): each for each in SCENARIOS}
-    if isinstance(name, str) and name in layouts:
-        raise ValueError(
-            f"{name!r} is for gym.make and gym.make_vec; here take {layouts[name]!r} with "
-            f"observation 'kinematics' and action 'meta'."
-        )
+        import_module(module, f"the environment {name!r}")
+    env_id = complete_id(name)
+    own = str(env_id).rpartition(":")[2]
+    if own in SCENARIOS or own in map(kinematics_id, SCENARIOS):
+        return env_id
     if is_highway_env_id(name):
         raise ValueError(
             f"{name!r} is an environment of HighwayEnv, not of the batched simulation: its drives become a problem by "
             f"rare_envs.highway_env_problem({name!r}, ego=...). The environments here are {', '.join(SCENARIOS)}."
         )
-    hint = did_you_mean(str(name), SCENARIOS)
-    raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
+    hint = did_you_mean(own, SCENARIOS)
+    raise ValueError(f"Unknown environment {name!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
+
+
+def split_version(env_id: str) -> tuple[str, int | None]:
+    """Return an id without its version, and the version; None where it has none."""
+    found = re.fullmatch(r"(.*)[-_][vV](\d+)", env_id)
+    return (found[1], int(found[2])) if found else (env_id, None)
 
 
 HIGHWAY_ENV_IDS = (
@@ -117,30 +95,37 @@ def is_highway_env_id(env_id: object) -> bool:
     return re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(env_id)) is not None
 
 
-def complete_id(env_id: str) -> str:
-    """Return the registered id for a spelling of it; else what is given, without "rare_envs:".
+def complete_id(name: str) -> str:
+    """Return the registered id that a name means; else what is given, without "rare_envs:".
 
     Namespace and version may be left out, and words be joined in any way: "cut_in", "CutIn" and "cut-in-v1" are
-    "rare_envs/CutIn-v1". Without a version it is the newest; names in several namespaces need theirs.
+    "rare_envs/CutIn-v1". Without a version it is the newest, without a namespace "rare_envs/", or the only one.
     """
-    if isinstance(env_id, str):  # what is no id is refused where the scenario is looked for
-        env_id = env_id.removeprefix("rare_envs:")
-    if str(env_id) in SCENARIOS or is_highway_env_id(env_id):
-        return env_id
-    namespace, name, version = _spell(str(env_id))
-    found: dict[str, tuple[int, str]] = {}  # the newest by namespace
-    for each in (each for known in SCENARIOS for each in (known, kinematics_id(known))):
-        own, its_name, its_version = _spell(each)
-        if its_name == name and namespace in ("", own) and version in (None, its_version):
-            found[own] = max(found.get(own, (-1, "")), (its_version or 0, each))
-    return next(iter(found.values()))[1] if len(found) == 1 else env_id
+    if not isinstance(name, str):  # what is no name is refused where the scenario is looked for
+        return name
+    module, colon, env_id = name.removeprefix("rare_envs:").rpartition(":")
+    known = [each for own in SCENARIOS for each in (own, kinematics_id(own))]
+    if is_highway_env_id(env_id) or env_id in known:
+        return f"{module}{colon}{env_id}"
+    namespace, letters, version = _spell(env_id)
+    newest: dict[str, tuple[int, str]] = {}  # by namespace
+    for each in known:
+        own, its_letters, its_version = _spell(each)
+        if its_letters == letters and namespace in ("", own) and version in (None, its_version):
+            newest[own] = max(newest.get(own, (-1, "")), (its_version or 0, each))
+    own = _OWN if _OWN in newest else next(iter(newest), "")
+    return f"{module}{colon}{newest[own][1] if own == _OWN or len(newest) == 1 else env_id}"
 
 
 def _spell(env_id: str) -> tuple[str, str, int | None]:
-    """Return namespace, bare letters and version of an id."""
+    """Return the bare letters of an id's namespace and name, and its version."""
     family, version = split_version(env_id)
-    namespace, _, name = family.rpartition("/")
-    return namespace, re.sub(r"[\W_]", "", name).lower(), version
+    namespace, _, name = (re.sub(r"[^\w/]|_", "", family).lower()).rpartition("/")
+    return namespace, name, version
+
+
+_OWN = "rareenvs"
+"""Bare letters of our namespace."""
 
 
 HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
@@ -153,8 +138,9 @@ def kinematics_id(env_id: str) -> str:
     return f"{name}-kinematics-v{version}"
 
 
-def split_layout(env_id: str) -> tuple[str, dict[str, str]]:
-    """Return the id of the scenario itself for one with HighwayEnv's layout, and the keyword arguments it means."""
-    layouts, env_id = {kinematics_id(each): each for each in SCENARIOS}, complete_id(env_id)
-    known = isinstance(env_id, str) and env_id in layouts
-    return (layouts[env_id], dict(HIGHWAY_ENV_LAYOUT)) if known else (env_id, {})
+def split_layout(name: str) -> tuple[str, dict[str, str]]:
+    """Return the id of the scenario itself for a name with HighwayEnv's layout, and the keyword arguments it means."""
+    env_id = complete_id(name)
+    module, colon, own = str(env_id).rpartition(":")
+    scenario = {kinematics_id(each): each for each in SCENARIOS}.get(own)
+    return (env_id, {}) if scenario is None else (f"{module}{colon}{scenario}", dict(HIGHWAY_ENV_LAYOUT))

@@ -69,7 +69,7 @@ class Episode(NamedTuple):
         >>> import torch
         >>> from rare_envs import scenarios, simulation
         >>> x = torch.tensor([[20.0, 15.0, 30.0]])  # ego and lead speed [m/s], gap [m]
-        >>> episode = simulation.World(scenarios.scenario_named("car_following")).start(x)
+        >>> episode = simulation.World(scenarios.find_scenario("car_following")).start(x)
         >>> float(episode.lead.gap), float(episode.f)  # f is the time to collision: 30 m / (5 m/s)
         (30.0, 6.0)
     """

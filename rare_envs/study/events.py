@@ -18,7 +18,7 @@ import numpy as np
 import samplers
 from rare_envs.exposure import CollisionRate
 from rare_envs.people import Event, EventCalibration, HumanBenchmark, calibration, people_in
-from rare_envs.scenarios.registry import env_id_of, find_scenario
+from rare_envs.scenarios.registry import complete_id, find_scenario
 from samplers import analysis
 from samplers.analysis.base_error import BaseUncertainty
 from samplers.analysis.reweight import find_fitted_base, refit_quantile
@@ -100,7 +100,7 @@ def find_calibration(event: str, study: Study) -> EventCalibration | None:
     It is that of the newest version of the scenario: the scripts of earlier ones have drivers as there are none.
     """
     env_id = study.question.env_id
-    newest = env_id_of(find_scenario(env_id).name) == env_id.rpartition(":")[2]
+    newest = complete_id(find_scenario(env_id).name) == env_id.rpartition(":")[2]
     return calibration(event, describe_traffic(study)) if newest else None  # type: ignore[arg-type]
 
 

@@ -22,7 +22,7 @@ from rare_envs.files import format_json, replace_text
 from rare_envs.people import HumanBenchmark
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
-from rare_envs.scenarios.registry import env_id_of, scenario_named
+from rare_envs.scenarios.registry import env_id_of, find_scenario, split_layout
 from rare_envs.startup import __version__
 from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
@@ -310,23 +310,21 @@ def risk(
         rare_envs.study.arguments.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
     """  # noqa: E501 (the example shows a whole message)
     sites = (sites,) if isinstance(sites, str) else sites
-    folder, bases, named = None if out is None else Path(out), bases or {}, isinstance(ego, str)
+    scenarios = (scenarios,) if isinstance(scenarios, str) else scenarios
+    folder, named = None if out is None else Path(out), isinstance(ego, str)
     ego_name = ego if named else type(ego).__name__
     with as_bad_input(ValueError):
-        _check_scenarios(scenarios, sites, bases)
-        chosen = [choose_base(scenario_named(name), bases.get(name), sites[0]) for name in scenarios]
+        chosen = _choose_scenarios(scenarios, sites, bases or {})
     with as_bad_input(TypeError, ValueError):
         if options.get("max_p") is not None:
             raise ValueError("Expected max_rate, a limit of the sum, not max_p.")
         asked = {"ego": ego_name, **options}
-        questions = [
-            Question(env_id=env_id_of(name), base=base, **asked) for name, base in zip(scenarios, chosen, strict=True)
-        ]
-    left_out = _find_misfits(dict(zip(scenarios, questions, strict=True)), None if named else ego)
+        questions = {name: Question(env_id=env_id, base=base, **asked) for name, (env_id, base) in chosen.items()}
+    left_out = _find_misfits(questions, None if named else ego)
     with as_bad_input(ValueError):
-        fitting = {name: each for name, each in zip(scenarios, questions, strict=True) if name not in left_out}
+        fitting = {name: each for name, each in questions.items() if name not in left_out}
         if not fitting:
-            names = ", ".join(map(text.name_scenario, scenarios))
+            names = ", ".join(map(text.name_scenario, questions))
             raise ValueError(f"The ego fits none of the scenarios {names}. {next(iter(left_out.values()))}")
         studies = [prepare(question, None if named else ego) for question in fitting.values()]
         for study in studies:
@@ -358,15 +356,26 @@ def risk(
     return found
 
 
-def _check_scenarios(names: Sequence[str], sites: Sequence[str], bases: Mapping[str, Any]) -> None:
-    """Raise a ValueError unless the scenarios exist, count nothing twice, and have bases of these sites."""
-    scenarios = [scenario_named(name) for name in names]
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"Expected one or more different scenarios, got {', '.join(names) or 'none'}.")
+def _choose_scenarios(
+    asked: Sequence[str], sites: Sequence[str], bases: Mapping[str, str | PathLike[str]]
+) -> dict[str, tuple[str, str]]:
+    """Return environment id and base of each scenario by its short name; names as of `env_id_of`.
+
+    Raises:
+        ValueError: Unless the scenarios exist, count nothing twice, and have bases of these sites.
+    """
+    ids = {split_layout(env_id)[0]: env_id for env_id in map(env_id_of, asked)}
+    given = {split_layout(env_id_of(name))[0]: base for name, base in bases.items()}
+    scenarios = [find_scenario(each) for each in ids]
+    names = [each.name for each in scenarios]
+    if not asked or len(set(names)) < len(asked):
+        raise ValueError(f"Expected one or more different scenarios, got {', '.join(asked) or 'none'}.")
+    if len(given) < len(bases):
+        raise ValueError(f"Expected one base for each scenario, got those of {', '.join(bases)}.")
     if set(TWICE) <= set(names):
         raise ValueError(f"Expected one of {', '.join(TWICE)}: a cut-in is a new leader, and would count twice.")
-    for name in set(bases) - set(names):
-        raise ValueError(f"A base is given for {name!r}, which is none of {', '.join(names)}.")
+    for name in given.keys() - ids.keys():
+        raise ValueError(f"A base is given for {name}, which is none of {', '.join(ids)}.")
     if not sites or len(set(sites)) < len(sites):
         raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
     known = sorted({name for scenario in scenarios for name in list_sites(scenario)})
@@ -380,6 +389,10 @@ def _check_scenarios(names: Sequence[str], sites: Sequence[str], bases: Mapping[
             )
         hint = did_you_mean(site, known)
         raise ValueError(f"No base of {', '.join(names)} is of a site {site!r}{hint}; there are {there}.")
+    return {
+        each.name: (ids[env_id], choose_base(each, given.get(env_id), sites[0]))
+        for env_id, each in zip(ids, scenarios, strict=True)
+    }
 
 
 def _find_misfits(questions: Mapping[str, Question], ego: Any) -> dict[str, str]:

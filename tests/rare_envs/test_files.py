@@ -27,7 +27,7 @@ from rare_envs.files import (
     replace_file,
     replace_text,
 )
-from rare_envs.scenarios import scenario_named
+from rare_envs.scenarios import find_scenario
 from rare_envs.scenarios.base import load_base
 from rare_envs.study.arguments import BadInput, read_question_file
 from rare_envs.study.html_report import read_recorded_events
@@ -107,7 +107,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "drivers": load_driver,
     "ego": load_ego,
     "statistics": lambda path: load_statistics(path, None, trust=True),
-    "base": lambda path: load_base(scenario_named("cut_in"), path),
+    "base": lambda path: load_base(find_scenario("cut_in"), path),
     "question": read_question_file,
     "events": lambda path: read_recorded_events(path, ["gap"]),
     "checkpoint": lambda path: read_checkpoint(path, ()),

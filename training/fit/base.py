@@ -12,7 +12,7 @@ import numpy as np
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution, Parameter
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from samplers.problem import FloatArray
 from training.fit.checks import check_predictions
 from training.fit.coordinates import (
@@ -89,7 +89,7 @@ def fit_base(
         (60, 2)
     """
     asked = Asked(n_refits, seed, report)
-    if scenario_named(scenario).name == "hard_brake":
+    if find_scenario(scenario).name == "hard_brake":
         events = keep_strata(events)
         fit = fit_hard_brake(scenario, events, asked)
     elif neighbours is not None:
@@ -119,7 +119,7 @@ def fit_base(
 
 def _fit_in_best_system(scenario: str, events: EventSet, system: str | None, asked: Asked) -> Fit:
     """Return one mixture in the coordinate system that the events support best, or in a named one."""
-    found = scenario_named(scenario)
+    found = find_scenario(scenario)
     parameters, systems = recorded_parameters(scenario), COORDINATE_SYSTEMS[found.name]
     names = [system.name for system in systems]
     if system not in (None, *names):
@@ -174,6 +174,6 @@ def _describe_fit(fit: SystemFit, scores: FloatArray) -> dict[str, Any]:
 
 def format_base(scenario: str, content: Mapping[str, Any]) -> str:
     """Return the text of a base file, which `load_base` reads, from the entries of a distribution's `to_dict`."""
-    parameters = scenario_named(scenario).parameters
+    parameters = find_scenario(scenario).parameters
     head = {"names": [p.name for p in parameters], "units": [p.unit for p in parameters]}
     return json.dumps({**head, **content, **head}, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

@@ -14,7 +14,7 @@ from pyarrow import csv
 from rare_envs.distributions.events import EventCounts
 from rare_envs.distributions.space import Parameter
 from rare_envs.files import open_ordinary
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from samplers.problem import FloatArray
 from training.data.events import ANSWERS
 
@@ -119,7 +119,7 @@ LEAST_ACCEPTED_GAP = 1.0
 
 def recorded_parameters(scenario: str, least_gap: float = LEAST_ACCEPTED_GAP) -> tuple[Parameter, ...]:
     """Return the parameters of a scenario that are recorded: of cut-ins the first seven, with a least gap behind."""
-    found = scenario_named(scenario)
+    found = find_scenario(scenario)
     if found.name != "cut_in":
         return tuple(found.parameters)
     return tuple(replace(p, low=least_gap) if p.name == "cut_in_gap" else p for p in found.parameters[:7])

@@ -28,7 +28,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.files import replace_text
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import env_id_of, find_scenario
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.checkpoints import TrainingInterrupted
@@ -141,7 +141,7 @@ def _choose_neighbours(beside: Sequence[tuple[FloatArray, NDArray[Any]]]) -> Nei
         return own
     few = f"{len(own.rows)} neighbours at random times, of {own.events.counts.clusters} half-minutes"
     typer.echo(f"{CUT_IN}: {few}, are too few; who has not looked is as at US 101", err=True)
-    return load_base(scenario_named(CUT_IN), "us101")
+    return load_base(find_scenario(CUT_IN), "us101")
 
 
 def fit_own_bases(
@@ -236,8 +236,7 @@ def fit_bases(
     """
     kind, path = recordings.kind_and_path()
     known = tuple(EVENT_RECIPES)
-    if unknown := sorted({*(scenarios or ())} - {*known}):
-        raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
+    scenarios = None if scenarios is None else [_read_scenario(each) for each in scenarios]
     if not name or Path(name).name != name:
         raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")
     endings = ("*.json",) if kind == "data" else ("events.csv", f"{glob.escape(name)}.json")
@@ -252,6 +251,15 @@ def fit_bases(
     gaps: Gaps = "cut" if cut_gaps else "error"
     tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
     return fit_own_bases(tables, scenarios, out, name, seed, n_refits, progress)
+
+
+def _read_scenario(name: str) -> str:
+    """Return the short name of a scenario of which recordings show the events."""
+    env_id, found = env_id_of(name), find_scenario(name).name
+    newest = {each: env_id_of(each) for each in EVENT_RECIPES}
+    if env_id != newest.get(found):
+        raise ValueError(f"No base of {env_id} can be fitted to recordings; expected {', '.join(newest.values())}.")
+    return found
 
 
 def _print_checks(scenario: str, base: FittedDistribution) -> None:

@@ -34,7 +34,7 @@ from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.distributions.stratified import CutNormals, StratifiedDistribution, Stratum
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from samplers.problem import FloatArray
 from training.fit.acceptance import LEAST_LIMIT, MOST_LIMIT, fit_accepted, profile_limit
 from training.fit.checks import (
@@ -141,7 +141,7 @@ def find_neighbours(
 
 def keep_neighbours(scenario: str, rows: FloatArray, clusters: NDArray[np.int64], near: float) -> Neighbours:
     """Return neighbours within the scenario's ranges."""
-    box = recorded_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)[:5]
+    box = recorded_parameters(scenario, tuple(find_scenario(scenario).parameters)[3].low)[:5]
     keep = np.logical_and.reduce([(rows[:, j] >= p.low) & (rows[:, j] <= p.high) for j, p in enumerate(box)])
     return Neighbours(rows[keep], clusters[keep], near)
 
@@ -230,7 +230,7 @@ def _unseen_finder(scenario: str, neighbours: Neighbours | Distribution, seed: i
     A base that has strata gives its own, and those of its refits in their order.
     """
     if isinstance(neighbours, Neighbours):
-        wide = recorded_parameters(scenario, tuple(scenario_named(scenario).parameters)[3].low)
+        wide = recorded_parameters(scenario, tuple(find_scenario(scenario).parameters)[3].low)
         events = neighbours.events
 
         def find(apart: FloatArray, rng: np.random.Generator | None) -> TruncatedGaussianMixture:
@@ -361,7 +361,7 @@ def fit_hard_brake(scenario: str, events: EventSet, asked: Asked) -> Fit:
     The loss of a braking to a standstill is the speed. Of a stratum of too few brakings there are none, see
     `keep_strata`.
     """
-    parameters = tuple(scenario_named(scenario).parameters)
+    parameters = tuple(find_scenario(scenario).parameters)
     split = _split_brakings(events, parameters)
     kept = [each for each in split if len(each.events.joint)]
     names = [each.name for each in kept]

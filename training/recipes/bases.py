@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.fitted import FittedDistribution, join_independent
 from rare_envs.distributions.stratified import CutNormals
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.data.events import (
@@ -127,7 +127,7 @@ class ShippedBase:
     @property
     def file(self) -> str:
         """Name of its file in the package."""
-        return Path(str(scenario_named(self.scenario).bases[self.name])).name
+        return Path(str(find_scenario(self.scenario).bases[self.name])).name
 
     def read(self, folder: Path) -> Read:
         """Return its events from the folder of compact tables."""
@@ -149,13 +149,13 @@ def fit_shipped_bases(
 ) -> Iterator[tuple[str, str]]:
     """Yield name and text of each file of the package for some scenarios, as soon as it is fitted."""
     for base in SHIPPED_BASES:
-        if scenario_named(base.scenario).name in scenarios:
+        if find_scenario(base.scenario).name in scenarios:
             yield base.file, fit_shipped_base(base, data, seed, n_refits)
 
 
 def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int | None = None) -> str:
     """Return the text of the file of a base of the package, from the folder of compact tables."""
-    file: Any = scenario_named(base.scenario).bases[base.name]
+    file: Any = find_scenario(base.scenario).bases[base.name]
     shipped = json.loads(file.read_text(encoding="utf-8"))
     source, known = shipped["provenance"]["source"], shipped["frequency"]
     events, counted = base.read(data)
@@ -254,7 +254,7 @@ def _read_i24_leaders(folder: Path) -> Read:
         parts.append(find_new_leaders(*(rows[name][chosen].astype(float) for name in ("speed", "rel_speed", "gap"))))
         drives.append(np.full(len(parts[-1]), drive, dtype=np.int64))
     events, clusters = np.concatenate(parts), np.concatenate(drives)
-    box, keep = scenario_named(FOLLOWING).parameters, np.ones(len(events), dtype=bool)
+    box, keep = find_scenario(FOLLOWING).parameters, np.ones(len(events), dtype=bool)
     inside = np.asarray(((events >= [p.low for p in box]) & (events <= [p.high for p in box])).all(axis=1))
     rule = ("within the ranges of the scenario", "outside the physical range", inside)
     log = ({"rule": "events read", "events": len(events)}, *drop_events(keep, [rule]))

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from agents import LearnedEgo, Provenance, save_driver
 from rare_envs.control.idm import IDM
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.settings import Clock
 from rare_envs.simulation.world import World, drive
 from rare_envs.startup import use_one_thread
@@ -104,7 +104,7 @@ def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> lis
     scenes = []
     for kind in kinds:
         case, clock = CASES.get(kind.scenario), Clock(horizon=kind.seconds)
-        world = make_world(case, kind.seconds) if case else World(scenario_named(kind.scenario), clock=clock)
+        world = make_world(case, kind.seconds) if case else World(find_scenario(kind.scenario), clock=clock)
         each = SCENE_VEHICLES // world.scenario.vehicles
         n = each * kind.scenes
         if case:

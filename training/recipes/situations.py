@@ -18,7 +18,7 @@ from torch import Tensor
 from agents.vision import OBSERVATION
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns, load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
 from rare_envs.sensors.lidar import perceive_traffic
 from rare_envs.simulation.background import Background, TrafficBackground, find_drivers
@@ -138,16 +138,16 @@ def make_situations() -> tuple[Situation, ...]:
         inner = 1 if road.lanes == 3 else int(rng.integers(1, road.lanes - 1))
         return make_ordinary_traffic("traffic", road, inner)
 
-    following, highway = Situation(somewhere(FOLLOWING), _draw_following), scenario_named("highway")
+    following, highway = Situation(somewhere(FOLLOWING), _draw_following), find_scenario("highway")
     traffic = Situation(in_traffic, draw_starts, OrdinaryDrivers())
     return (
         traffic,
         following,
         Situation(lambda rng: highway, load_base(highway).sample, find_drivers(highway.drivers)),
-        Situation(somewhere(scenario_named("rare_envs/CutIn-v0")), _draw_cut_in),
+        Situation(somewhere(find_scenario("rare_envs/CutIn-v0")), _draw_cut_in),
         traffic,
         following,
-        Situation(somewhere(scenario_named("hard_brake")), _draw_hard_brake),
+        Situation(somewhere(find_scenario("hard_brake")), _draw_hard_brake),
     )
 
 

@@ -29,6 +29,7 @@ from rare_envs.scenarios.registry import (
     env_id_of,
     find_scenario,
     kinematics_id,
+    split_layout,
 )
 from rare_envs.sensors.camera import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
@@ -186,7 +187,7 @@ def _print_table(console: Console, title: str, heads: list[str], rows: Iterable[
 
 def list_bases(scenario: str) -> tuple[str, dict[str, dict[str, Any]]]:
     """Return the environment id that an id or a short name means, and its base distributions, the default first."""
-    env_id = scenario if ":" in scenario else env_id_of(scenario)
+    env_id = split_layout(env_id_of(scenario))[0]
     found = find_scenario(env_id)
     return env_id, {name: _describe_base(found, name) for name in found.bases}
 

@@ -5,13 +5,13 @@ import pytest
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 
-NAMES = [p.name for p in scenario_named("rare_envs/CutIn-v0").parameters]
+NAMES = [p.name for p in find_scenario("rare_envs/CutIn-v0").parameters]
 
 
 def make_space():
-    scenario = scenario_named("rare_envs/CutIn-v0")
+    scenario = find_scenario("rare_envs/CutIn-v0")
     return ScenarioSpace(scenario.parameters, load_base(scenario, "us101-15-offsets"))
 
 

@@ -18,7 +18,7 @@ from rare_envs.distributions import (
 )
 from rare_envs.distributions.acceptance import log_acceptance, needed_after
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 
 LIMIT = -3.6334
 NAMES = ("ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap")
@@ -152,7 +152,7 @@ def test_parameters_of_strata_are_shares_and_those_of_the_parts() -> None:
 
 
 def test_normals_of_a_file_are_the_same_block_in_all_refits_and_their_ends_have_an_image() -> None:
-    base = load_base(scenario_named("rare_envs/CutIn-v1"), "us101-test")
+    base = load_base(find_scenario("rare_envs/CutIn-v1"), "us101-test")
     pool = base.covering_ensemble()
     x = pool.sample(200, np.random.default_rng(0))
     mean = np.mean([np.exp(each.log_prob(x)) for each in base.refits], axis=0)
@@ -165,7 +165,7 @@ def test_normals_of_a_file_are_the_same_block_in_all_refits_and_their_ends_have_
 @pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v1", "rare_envs/HardBrake-v0"])
 def test_points_far_out_go_there_and_back_as_finite_numbers(env_id: str) -> None:
     """Searches go there: 2,000 points up to 12 and 38 standard deviations out in each direction."""
-    base = load_base(scenario_named(env_id), "us101")
+    base = load_base(find_scenario(env_id), "us101")
     u = np.random.default_rng(0).uniform(-1.0, 1.0, (2000, base.low.size)) * np.repeat([12.0, 38.0], 1000)[:, None]
     x = base.from_standard_normal(u)
     assert ((x >= base.low) & (x <= base.high)).all()

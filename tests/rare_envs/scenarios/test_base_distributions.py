@@ -16,11 +16,11 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.scenarios.base import Scenario, load_base
-from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from tests.rare_envs.scenarios.standing import STANDING
 
-FOLLOWING = scenario_named("car_following")
-CUT_IN = scenario_named("cut_in")
+FOLLOWING = find_scenario("car_following")
+CUT_IN = find_scenario("cut_in")
 
 
 def rng() -> np.random.Generator:

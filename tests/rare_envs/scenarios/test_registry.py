@@ -12,7 +12,6 @@ from rare_envs.scenarios.registry import (
     complete_id,
     env_id_of,
     find_scenario,
-    scenario_named,
     split_layout,
 )
 from tests.rare_envs.scenarios.standing import STANDING
@@ -42,24 +41,19 @@ def test_a_scenario_is_imported_when_it_is_first_asked_for_and_kept(place: str) 
         registry["a/D-v0"]
 
 
-def test_scenarios_by_id_and_by_name_are_the_same() -> None:
-    for env_id, name in (("rare_envs/HardBrake-v0", "hard_brake"), ("rare_envs/CutIn-v1", "cut_in")):
-        assert find_scenario(env_id) is scenario_named(name) is SCENARIOS[env_id]
-        assert scenario_named(name).name == name
-    with pytest.raises(
-        ValueError, match=r"^Unknown scenario 'cut_ins' \(did you mean 'cut_in'\?\); there are car_foll"
-    ):
-        scenario_named("cut_ins")
-
-
 @pytest.mark.parametrize("name", ["CutIn", "cut-in", "cut_in", "cutin", "CutIn-v1", "cut_in-v1", "cut_in_v1"])
 @pytest.mark.parametrize("namespace", ["", "rare_envs/", "rare_envs:rare_envs/"])
 def test_every_spelling_of_a_name_means_the_same(namespace: str, name: str) -> None:
-    assert complete_id(namespace + name) == "rare_envs/CutIn-v1"
-    assert find_scenario(namespace + name) is scenario_named(namespace + name) is SCENARIOS["rare_envs/CutIn-v1"]
-    assert complete_id("highway") == "rare_envs/Highway-v0"
+    assert env_id_of(namespace + name) == complete_id(namespace + name) == "rare_envs/CutIn-v1"
+    assert find_scenario(namespace + name) is SCENARIOS["rare_envs/CutIn-v1"]
+
+
+def test_a_name_may_have_a_version_and_a_layout() -> None:
+    assert [env_id_of(each) for each in ("cut_in-v0", "Hard-Brake", "highway", "cut_in_kinematics")] == [
+        *("rare_envs/CutIn-v0", "rare_envs/HardBrake-v0", "rare_envs/Highway-v0", "rare_envs/CutIn-kinematics-v1")
+    ]
     assert complete_id("highway-v0") == "highway-v0"  # HighwayEnv's own id
-    assert complete_id("cut_in_kinematics") == "rare_envs/CutIn-kinematics-v1"
+    assert find_scenario("cut_in-kinematics-v0") is SCENARIOS["rare_envs/CutIn-v0"]
 
 
 @pytest.mark.parametrize(
@@ -69,7 +63,7 @@ def test_every_spelling_of_a_name_means_the_same(namespace: str, name: str) -> N
         ("highways", r"^Unknown environment 'highways'.*; the environments are rare_envs/CarFollowing-v0, rare_envs"),
         (None, "^Unknown environment None; the environments are rare_envs/CarFollowing-v0, "),
         (["rare_envs/CutIn-v0"], r"^Unknown environment \['rare_envs/CutIn-v0'\]"),
-        ("rare_envs/CutIn-kinematics-v0", r"here take 'rare_envs/CutIn-v0' with observation 'kinematics' and action '"),
+        ("cut_ins", r"^Unknown environment 'cut_ins' \(did you mean 'rare_envs/CutIn-v1'"),
         *(
             (name, rf"rare_envs.highway_env_problem\('{name}', ego=...\)\. The environments here are rare_envs/CarFoll")
             for name in ("highway-fast-v0", "roundabout-v0")
@@ -89,19 +83,19 @@ def test_an_id_may_name_the_module_that_registers_it(place: str) -> None:
     )
     try:
         assert find_scenario(f"{place}:tests/Crest-v0") is SCENARIOS["rare_envs/CutIn-v0"]
-        assert scenario_named("cut_in") is SCENARIOS["rare_envs/CutIn-v1"]  # a name keeps its first family of ids
+        assert find_scenario("cut_in") is SCENARIOS["rare_envs/CutIn-v1"]
         with pytest.raises(ValueError, match="did you mean 'tests/Crest-v0'"):
             find_scenario(f"{place}:tests/Crests-v0")
     finally:
         del SCENARIOS["tests/Crest-v0"]
 
 
-def test_an_id_may_lack_its_namespace_unless_two_end_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert find_scenario("CutIn-v0") is find_scenario("rare_envs/CutIn-v0")
-    assert env_id_of("CutIn-v0") == "rare_envs/CutIn-v0" and env_id_of("cut_in") == "rare_envs/CutIn-v1"
+def test_a_name_without_namespace_is_ours_or_the_only_one(monkeypatch: pytest.MonkeyPatch) -> None:
     assert split_layout("CutIn-kinematics-v0") == split_layout("rare_envs/CutIn-kinematics-v0")
-    assert complete_id("a:CutIn-v0") == "a:CutIn-v0"
-    monkeypatch.setitem(SCENARIOS.data, "mine/CutIn-v0", STANDING)
-    assert complete_id("CutIn-v0") == "CutIn-v0"
-    with pytest.raises(ValueError, match=r"^Unknown environment 'CutIn-v0' \(did you mean '\w+/CutIn-v0'"):
-        find_scenario("CutIn-v0")
+    assert complete_id("a:cut_in-v0") == "a:rare_envs/CutIn-v0"  # the module is still imported first
+    for each in ("mine/CutIn-v0", "mine/Bend-v0", "theirs/Bend-v0", "mine/Crest-v2"):
+        monkeypatch.setitem(SCENARIOS.data, each, STANDING)
+    assert complete_id("cut_in-v0") == "rare_envs/CutIn-v0" and find_scenario("mine/cut-in") is STANDING
+    assert complete_id("crest") == "mine/Crest-v2"
+    with pytest.raises(ValueError, match=r"^Unknown environment 'bend' \(did you mean '\w+/Bend-v0'"):
+        find_scenario("bend")

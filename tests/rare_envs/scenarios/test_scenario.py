@@ -22,7 +22,7 @@ import rare_envs
 import samplers
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import Others, Scenario, drive_points, keep_straight, try_scenario
-from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.study.cli.app import app
 from rare_envs.study.cli.listing import list_names
 from rare_envs.traffic.road import ReferenceLine, Road
@@ -145,7 +145,7 @@ def registered():
 
 def test_it_is_known_everywhere(registered):
     assert registered in rare_envs.ENV_IDS
-    assert scenario_named("standing") is STANDING
+    assert find_scenario("standing") is STANDING
     entry = list_names()["environments"][registered]
     assert [p["name"] for p in entry["parameters"]] == ["speed", "distance"]
     assert entry["bases"] == ["even"]

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from typer.testing import CliRunner, Result
 
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study import Question, plots, prepare, run_into
 from rare_envs.study.cli.app import app
 
@@ -67,7 +67,7 @@ restless = made(lambda seen: np.random.uniform(-1, 1, (len(seen), 2)))
 
 def write_base(path: Path, gap: float) -> Path:
     """A base for car-following at 20 m/s behind 10 m/s with gaps around the one given."""
-    parameters = scenario_named("car_following").parameters
+    parameters = find_scenario("car_following").parameters
     spread = [[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 25.0]]
     base = {
         "names": [p.name for p in parameters],

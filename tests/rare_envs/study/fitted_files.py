@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 
 MEANS = {
     "cut_in": (20.0, 14.0, 20.0, 9.5, 30.0, 3.5, 4.0, -5.0, -3.0, 0.0, 0.0, 0.0, 0.0),  # who does not look or notice
@@ -34,7 +34,7 @@ def fitted_entries(scenario: str, spread: float = 0.3, shift: float = 0.0, **cha
 
     The means of the 30 refits differ by `spread`, those of the base are moved by `shift`, in standard deviations of it.
     """
-    parameters = scenario_named(scenario).parameters
+    parameters = find_scenario(scenario).parameters
     sd = np.array(SPREADS[scenario])
     mean = np.array(MEANS[scenario]) + shift * sd
     rng = np.random.default_rng(0)

@@ -111,7 +111,7 @@ def test_bad_input_is_one_line_before_any_simulation(bases: dict[str, str], monk
             {"sites": ("i80",), "bases": {}},
             r"hard_brake has no base of the site 'i80' \(it has us101\): --base hard_br",
         ),
-        ({"bases": {"highway": "x.json"}}, "highway"),
+        ({"bases": {"highway": "x.json"}}, "rare_envs/Highway-v0"),
         ({"speed": 3}, "speed"),
     ):
         with pytest.raises(BadInput, match=said) as refused:

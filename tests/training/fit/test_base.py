@@ -9,7 +9,7 @@ from scipy.stats import norm
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from training.fit.base import fit_base, format_base
 from training.fit.checks import CHECK_DRAWS, check_predictions
 from training.fit.filters import EventSet
@@ -39,7 +39,7 @@ def test_a_base_carries_all_that_says_what_it_is_worth_and_so_does_its_file(quic
     path.write_text(format_base("car_following", base.to_dict()), encoding="utf-8")
     data = json.loads(path.read_text(encoding="utf-8"))
     assert (data["names"], data["units"]) == (["ego_speed", "lead_speed", "gap"], ["m/s", "m/s", "m"])
-    again = load_base(scenario_named("car_following"), path)
+    again = load_base(find_scenario("car_following"), path)
     x = base.sample(100, np.random.default_rng(0))
     for one, other in zip((base, *base.refits), (again, *again.refits), strict=True):
         assert np.array_equal(one.log_prob(x), other.log_prob(x))

@@ -9,7 +9,7 @@ import pytest
 import training.fit.checks as checks
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.cut_in import CUTTER_IDM, CutterModel
-from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from tests.training.shared_data import DATA, needs_data
 from training.data.events import ANSWERS, cut_in_events, measure_answer
 from training.data.table import synthetic_traffic
@@ -47,7 +47,7 @@ def test_drivers_go_on_as_recorded_ones_did(site, followers, cutters):
     assert found["followers"]["rmse"] <= (0.55 if site == "i24" else 0.75)
     assert found["followers"]["braking"] == 0 and found["followers"]["share_simulated"] < 0.15
     assert found.get("cutters", {"rmse": 0.0})["rmse"] <= 0.75
-    shipped = {} if site == "i24" else load_base(scenario_named("rare_envs/CutIn-v1"), site).record["motion"]
+    shipped = {} if site == "i24" else load_base(find_scenario("rare_envs/CutIn-v1"), site).record["motion"]
     for who, entries in shipped.items():
         assert found[who] == pytest.approx(entries, abs=0.02)
 

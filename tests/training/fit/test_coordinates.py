@@ -7,7 +7,7 @@ import pytest
 from sklearn.mixture import GaussianMixture
 
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from training.fit import coordinates as module
 from training.fit import mixture as mixture_fit
 from training.fit import refits
@@ -63,7 +63,7 @@ def test_a_start_leads_where_it_does_in_an_independent_implementation(points, co
     assert likelihood == pytest.approx(len(points) * model.score(points), rel=1e-12)
 
 
-FOLLOWING = scenario_named("car_following").parameters
+FOLLOWING = find_scenario("car_following").parameters
 CUT_IN = recorded_parameters("cut_in")
 PLAIN, LOG_GAP, CLOSING = COORDINATE_SYSTEMS["car_following"]
 COMPONENT = ([1.0], [[15.0, 2.8, 0.0]], [np.diag([9.0, 0.16, 0.04])])

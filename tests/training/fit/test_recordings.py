@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from tests.training.data.recordings import (
     CLOCK,
     PAUSE,
@@ -94,7 +94,7 @@ def test_pairs_that_were_under_way_are_no_new_leaders(tmp_path):
     rows = ["v_ego,v_lead,gap,at_entry,recording,frame", "10,9,20,true,a,0", "11,9,20,false,a,5", "12,9,0.5,false,a,9"]
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
     recipe = EVENT_RECIPES["car_following"]
-    events = filter_events(read_events(path, recipe), recipe, scenario_named("car_following").parameters)
+    events = filter_events(read_events(path, recipe), recipe, find_scenario("car_following").parameters)
     assert events.joint.tolist() == [[11.0, 9.0, 20.0]]
     dropped = {entry["rule"]: entry["dropped"] for entry in events.log if entry.get("dropped")}
     assert dropped == {"not at_entry": 1, "1 <= gap <= 150 m": 1}
@@ -125,14 +125,14 @@ def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
         "cut_in_own.json",
         "hard_brake_own.json",
     ]
-    assert [each.name for each in load_base(scenario_named("hard_brake"), files[2]).strata] == ["slowing"]
-    own = load_base(scenario_named("cut_in"), files[1])
+    assert [each.name for each in load_base(find_scenario("hard_brake"), files[2]).strata] == ["slowing"]
+    own = load_base(find_scenario("cut_in"), files[1])
     assert [each.name for each in own.strata] == ["unseen", "looked"]
     assert own.record["motion"]["cutters"]["events"] > 10
     printed = capsys.readouterr().err
     assert "cut_in, recorded / expected: looked: TTC < 2 s " in printed and "cut_in, followers: " in printed
     for scenario, file in zip(("car_following", "cut_in"), files, strict=False):
-        points = load_base(scenario_named(scenario), file).sample(100, np.random.default_rng(0))
+        points = load_base(find_scenario(scenario), file).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all() and 12.0 < points[:, 0].mean() < 25.0  # simulated: 9 to 27 m/s
         source = json.loads(file.read_text(encoding="utf-8"))["provenance"]["source"]
         assert source["data"] == "recordings I294_L1-1-left"
@@ -158,7 +158,7 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
     speeds, decelerations = rng.uniform(8.0, 16.0, n), np.exp(rng.normal(np.log(2.0), 0.25, n))
     table = stopping_traffic(speeds, np.exp(rng.normal(np.log(12.0), 0.4, n)), decelerations)
     fit_own_bases([table], ["hard_brake"], tmp_path, "stops", n_refits=3)
-    base = load_base(scenario_named("hard_brake"), tmp_path / "hard_brake_stops.json")
+    base = load_base(find_scenario("hard_brake"), tmp_path / "hard_brake_stops.json")
     assert base.events.used == (n,) and base.events.cluster == "half-minute"
     assert base.events.clusters == len(np.unique((400 * np.arange(n) + PAUSE - 8) // 300))
     assert len(base.refits) == 3
@@ -183,7 +183,7 @@ def test_bad_arguments_are_refused(tmp_path):
         ({"highd": "none"}, {}, "There is no folder none; expected the data folder of highD"),
         ({"ngsim": "none.csv"}, {}, "Cannot read none.csv"),
         ({"data": "none"}, {}, "Cannot read events from"),
-        ({"ngsim": "none.csv"}, {"scenarios": ["merge"]}, "Unknown scenario merge"),
+        ({"ngsim": "none.csv"}, {"scenarios": ["merge"]}, "Unknown environment 'merge'"),
         ({"ngsim": "none.csv"}, {"name": "a/b"}, "part of file names, such as cologne, got 'a/b'"),
     ):
         recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})

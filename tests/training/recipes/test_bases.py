@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rare_envs.scenarios.base import load_base
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import find_scenario
 from tests.training.shared_data import DATA, needs_data
 from training.fit.coordinates import BIC_TIE
 from training.recipes.bases import (
@@ -44,8 +44,8 @@ def shipped(name):
 @pytest.mark.parametrize("base", SHIPPED_BASES, ids=lambda base: f"{base.scenario}-{base.name}")
 def test_recorded_events(base):
     events, counted = base.read(DATA)
-    box = scenario_named(base.scenario).parameters
-    frequency = load_base(scenario_named(base.scenario), base.name).frequency
+    box = find_scenario(base.scenario).parameters
+    frequency = load_base(find_scenario(base.scenario), base.name).frequency
     if (base.scenario, base.name) in COUNTS:
         counts = events.counts
         assert (counts.used, counts.clusters, counts.cluster) == COUNTS[base.scenario, base.name]
@@ -63,7 +63,7 @@ def test_shipped_files_say_what_they_are_worth(base):
     file = shipped(base.file)
     record = file["provenance"]
     assert {"site", "data", "licence", "moment"} <= set(record["source"])
-    fitted = load_base(scenario_named(base.scenario), base.name)
+    fitted = load_base(find_scenario(base.scenario), base.name)
     assert (fitted.frequency is None) == ("no_frequency" in record["source"])
     if fitted.strata:
         assert len(fitted.refits) == 30 and fitted.checks
@@ -124,7 +124,7 @@ def compare_strata(written, expected):
 def test_what_drivers_accept_is_supported_by_the_recorded_starts():
     """Log likelihood over no refusal: most at 0.5 m/s^2 of a coarse grid, by about 1 (38 starts of US 101)."""
     for name, low in (("us101", 0.5), ("i80", 2.0)):
-        record = load_base(scenario_named("rare_envs/CutIn-v1"), name).record["accepted"]
+        record = load_base(find_scenario("rare_envs/CutIn-v1"), name).record["accepted"]
         profile = record["log_likelihood_over_none"]
         assert max(profile, key=profile.get) == "0.5" and profile["0.5"] > low
         assert np.std(np.log(record["limits_of_refits"])) > 0.05
@@ -149,7 +149,7 @@ def test_starts_at_a_site_that_was_not_used_are_as_the_refits_expect(site, other
     """
     recorded = next(each for each in SHIPPED_BASES if each.answers and each.name == other).read(DATA)[0].joint
     rng, found = np.random.default_rng(0), []
-    for each in load_base(scenario_named("rare_envs/CutIn-v1"), site).refits:
+    for each in load_base(find_scenario("rare_envs/CutIn-v1"), site).refits:
         drawn = each.strata[1].base.sample(20 * len(recorded), rng)
         found.append(describe_starts(drawn.reshape(20, len(recorded), -1)))
     found, wanted = np.concatenate(found, axis=1), np.array(describe_starts(recorded))[:, None]
