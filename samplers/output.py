@@ -262,6 +262,7 @@ FACTS: Mapping[str, str] = MappingProxyType(
         "not calibrated": "not calibrated: human driver model {model}, {far}",
         "not measured": "not calibrated: human driver model not measured in {traffic}",
         "crash": "{who} runs into {whom}, {speed} m/s at contact, delta-v {delta_v} m/s",
+        "avoids": "{driver} avoids {share} of these",
         "likeliest": "{kinds}; most likely: {what}",
         "usual": "every parameter usual",
         "unusual": "{name} {value} {unit} (usually {low} to {high})",

@@ -41,7 +41,7 @@ from rare_envs.study import arguments, writing
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
 from rare_envs.study.ego_check.checks import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
-from rare_envs.study.failures import CrashKinds, classify_failures
+from rare_envs.study.failures import CrashKinds, classify_failures, drive_by_others
 from rare_envs.study.question import (
     Study,
     build_problem,
@@ -148,6 +148,7 @@ def run(
             raise RunInterrupted(f"Stopped: no estimate yet, {known}") from None
         with arguments.keep_answer(report):
             estimate, kinds = classify_failures(study.problem, report.estimate)
+            kinds = drive_by_others(study, estimate, kinds)
             report = replace(report, estimate=estimate, kinds=kinds)
             table.write(estimate, kinds.by_scenario)
     with arguments.keep_answer(report):

@@ -2,7 +2,8 @@
 
 Severity is P[collision with delta-v > v] over v, and the expected number of serious injuries. Failures of one kind of
 crash are one mode, unless they lie in regions apart: clusters of density (HDBSCAN) in standard normal space that
-together hold at least half of them. The rest belongs to the nearest cluster.
+together hold at least half of them. The rest belongs to the nearest cluster. Other drivers are put in the ego's place in
+failing scenarios of each mode, to tell whether a person would have avoided the crash.
 
 References:
     Campello, Moulavi and Sander, "Density-based clustering based on hierarchical density estimates", PAKDD 2013.
@@ -23,9 +24,13 @@ from numpy.typing import ArrayLike, NDArray
 
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.plugins import EgoGone
+from rare_envs.egos.needs import RULE_BASED_EGOS
+from rare_envs.plugins import EgoGone, one_line
 from rare_envs.problem import DrivingProblem
+from rare_envs.scenarios.registry import split_layout
 from rare_envs.study.episodes import digest_scenarios, list_columns
+from rare_envs.study.question import Study, build_problem
+from rare_envs.study.replay import OWN_NOISE
 from rare_envs.traffic.crash import CRASH_KINDS, NONE, OTHERS, Crash, describe_crash
 from samplers import analysis
 from samplers.analysis.weighted import choose_failures, require_sample
@@ -253,6 +258,19 @@ KIND_DESCRIPTIONS = MappingProxyType(
 """Kinds of crash in words."""
 Crashes = Mapping[bytes, str]
 """Kinds of crash of failures that were driven again, by `digest_scenarios`."""
+OTHER_DRIVERS = ("human", "cc_human", "idm")
+"""Egos that drive the failing scenarios too, those of them that there are."""
+ROWS_DRIVEN = 200
+"""Failing scenarios of a mode in which each of them drives, and failures of the list, the most likely ones."""
+
+
+class OtherDriver(NamedTuple):
+    """What another driver does in failing scenarios."""
+
+    fails: float
+    """Share of them in which it fails too, by their weights."""
+    n: int
+    """How many different ones."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -267,11 +285,22 @@ class FailureMode:
     """Number of its most likely failure in the list of failures; None if the list has none of it."""
     center: Mapping[str, float]
     """Weighted mean of the parameters that are shown, by name."""
+    drawn: FloatArray = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    """Failing scenarios of it, drawn by their weights, shape (n, d)."""
+    others: Mapping[str, OtherDriver] = field(default_factory=dict)
+    """What other drivers do in these, by name; empty where that is not known."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         share = {**self.share.to_dict(), "interval": list(self.share.interval)}
-        return {"crash": self.crash, **share, "failure": self.failure, "center": dict(self.center)}
+        others = {name: each._asdict() for name, each in self.others.items()}
+        return {
+            "crash": self.crash,
+            **share,
+            "failure": self.failure,
+            "center": dict(self.center),
+            "other_drivers": others,
+        }
 
 
 Labels = NDArray[np.object_]
@@ -291,8 +320,16 @@ def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crash
         mean = np.average(x[mine], axis=0, weights=weights[mine] if weights[mine].sum() > 0 else None)
         center = {column.name: float(mean[j]) for j, column in enumerate(list_columns(space)) if column.shown}
         failure, crash = int(numbers[0]) if len(numbers) else None, str(kinds[mine][0])
-        modes.append(FailureMode(crash=crash, share=share, failure=failure, center=center))
+        drawn = x[mine][_draw_by_weight(weights[mine])]
+        modes.append(FailureMode(crash=crash, share=share, failure=failure, center=center, drawn=drawn))
     return tuple(modes)
+
+
+def _draw_by_weight(weights: FloatArray) -> NDArray[np.int64]:
+    """Return `ROWS_DRIVEN` rows by their weights (n,), evenly spaced in the sum: heavy ones stand several times."""
+    upto = np.cumsum(weights if weights.sum() > 0 else np.ones(len(weights)))
+    places = (np.arange(ROWS_DRIVEN) + 0.5) / ROWS_DRIVEN * upto[-1]
+    return np.minimum(np.searchsorted(upto, places), len(weights) - 1)
 
 
 def assign_modes(
@@ -372,6 +409,25 @@ class CrashKinds:
     """How severe the collisions are; None if there are none, or it is not known."""
     modes: tuple[FailureMode, ...] = ()
     """Modes of failure, the largest first; empty if they are not known."""
+    others_listed: Mapping[str, FloatArray] = field(default_factory=dict)
+    """f of each failure of the list with another driver in the ego's place, by its name; NaN where it did not drive."""
+    others_unknown: Mapping[str, str] = field(default_factory=dict)
+    """Why others cannot drive here, by name."""
+    n_others: int = 0
+    """Simulations with other drivers; not in the run's n_sim."""
+
+    def find_others(self, kind: str | None = None) -> dict[str, OtherDriver]:
+        """Return what other drivers do in failing scenarios of one kind of crash, or of all, by name."""
+        modes = [mode for mode in self.modes if mode.others and kind in (None, mode.crash)]
+        shares = np.array([mode.share.of_failures for mode in modes])
+        if not shares.sum() > 0:
+            return {}
+        found = {}
+        for name in modes[0].others:
+            each = [mode.others[name] for mode in modes]
+            fails = float(shares @ [one.fails for one in each] / shares.sum())
+            found[name] = OtherDriver(fails, sum(one.n for one in each))
+        return found
 
 
 def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> tuple[samplers.Estimate, CrashKinds]:
@@ -405,6 +461,50 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> t
     listed = tuple(described.get(digest) for digest in digest_scenarios(estimate.failures.x))
     modes = find_modes(problem.space, estimate, kinds)
     return estimate, CrashKinds(shares, listed, by_scenario=kinds, severity=severity, modes=modes)
+
+
+def drive_by_others(study: Study, estimate: samplers.Estimate, kinds: CrashKinds) -> CrashKinds:
+    """Put other drivers in the ego's place in the failures of the list, and in failing scenarios of each mode.
+
+    They meet the same traffic. Noise of their own is drawn anew, or is that of the ego where it is of their kind.
+    """
+    if not kinds.modes:
+        return kinds
+    most_likely = [mode.failure for mode in kinds.modes if mode.failure is not None]
+    listed = np.union1d(np.arange(min(len(estimate.failures), ROWS_DRIVEN)), most_likely).astype(np.int64)
+    x = np.vstack([estimate.failures.x[listed], *(mode.drawn for mode in kinds.modes)])
+    # layouts are for policies, and so are kinds of observation, actions and cores
+    of_ego: dict[str, Any] = {"observation": None, "action": None, "core": "auto", "device": "cpu"}
+    question = replace(study.question, env_id=split_layout(study.question.env_id)[0], **of_ego)
+    f, unknown = dict[str, FloatArray](), dict[str, str]()
+    for name in filter(RULE_BASED_EGOS.__contains__, OTHER_DRIVERS):
+        try:
+            f[name] = _drive_instead(build_problem(question, name), study.problem, x)
+        except Exception as error:  # measures may be the user's
+            unknown[name] = one_line(error)
+    first, modes = len(listed), list[FailureMode]()
+    for mode in kinds.modes:
+        rows = slice(first, first := first + len(mode.drawn))
+        fails = {name: float(np.mean(each[rows] <= estimate.gamma)) for name, each in f.items()}
+        n = len(np.unique(mode.drawn, axis=0))
+        modes.append(replace(mode, others={name: OtherDriver(share, n) for name, share in fails.items()}))
+    of_list = {name: np.full(len(estimate.failures), np.nan) for name in f}
+    for name, each in f.items():
+        of_list[name][listed] = each[: len(listed)]
+    n_others = len(f) * len(x)
+    return replace(kinds, modes=tuple(modes), others_listed=of_list, others_unknown=unknown, n_others=n_others)
+
+
+def _drive_instead(other: DrivingProblem, problem: DrivingProblem, x: FloatArray) -> FloatArray:
+    """Return f (n,) of scenarios x (n, d) of a problem with the driver of another one in the place of its ego."""
+    rng, known, parts = np.random.default_rng(0), problem.space.columns(x), list[FloatArray]()
+    if type(other.needs.noise) is not type(problem.needs.noise):
+        known.pop(OWN_NOISE, None)
+    for name, size in zip(other.space.names, other.space.sizes, strict=True):
+        parts.append(known[name].reshape(len(x), -1) if name in known else rng.standard_normal((len(x), size)))
+        if parts[-1].shape[1] != size:
+            raise ValueError(f"its traffic has {size} values of {name}, that of the ego {parts[-1].shape[1]}")
+    return other.evaluate(np.hstack(parts))
 
 
 def _drop_repeated(failures: samplers.Failures) -> samplers.Failures:

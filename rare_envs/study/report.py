@@ -252,6 +252,7 @@ class Report:
             word = "off" if noise is False else noise
             found.insert(0, f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)")
         found += [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
+        found += [f"what {name} would do is not known: {why}" for name, why in self.kinds.others_unknown.items()]
         found += [f"sensitivity is not known: {self.sensitivity}"] if isinstance(self.sensitivity, str) else []
         if self.repeatability is not None and self.repeatability.n_elsewhere is None:
             found.append("whether the ego answers alike in another process is not known: it gave no answer there")
@@ -427,7 +428,15 @@ class Report:
             "seconds": self.seconds,
             "earlier_seconds": self.earlier_seconds,
             "n_failures": failures.total,
-            "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
+            "kinds": {
+                kind: {
+                    **share.to_dict(),
+                    "other_drivers": {n: each._asdict() for n, each in self.kinds.find_others(kind).items()},
+                }
+                for kind, share in self.kinds.shares.items()
+            },
+            "other_drivers": {name: each._asdict() for name, each in self.kinds.find_others().items()},
+            "n_other_drivers": self.kinds.n_others,
             "modes": [mode.to_dict() for mode in self.kinds.modes],
             "curve": convert(self.curve),
             "severity": convert(self.kinds.severity),

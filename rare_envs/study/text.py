@@ -37,6 +37,8 @@ EVENT_NOUNS = {
     "car_following": "new leaders",
 }
 """Events, and those of scenarios, in the plural."""
+OTHER_NOUNS = {MODEL: "human driver model", "cc_human": "competent and careful driver", "idm": "IDM"}
+"""Drivers that are put in the ego's place."""
 SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulation"}
 
 
@@ -351,6 +353,9 @@ def _describe_crashes(report: Report) -> str:
     k = _find_likeliest(failures)
     what, unusual = _describe_end(report, k), _list_unusual(space, failures.x[k])
     text = f"{what}, {unusual or say('usual')}"
+    other = report.kinds.find_others().get(MODEL)
+    if other is not None and other.n >= ENOUGH and report.study.question.ego != MODEL:
+        kinds += f"; {say('avoids', driver=OTHER_NOUNS[MODEL], share=format_share(1 - other.fails))}"
     return say("likeliest", kinds=kinds, what=text) if kinds else text
 
 

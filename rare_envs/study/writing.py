@@ -14,6 +14,7 @@ from dataclasses import asdict
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -194,7 +195,8 @@ def write_run(folder: Path, report: Report) -> None:
     space, faults, kinds = report.study.problem.space, report.faults, report.kinds
     replace_text(folder / run_folder.RESULT, format_json(report_as_json(report)) + "\n")
     nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in run_folder.CRASH[1:]))
-    write_failures(folder, space, report.estimate.failures, [_list_crash(each) or nobody for each in report.crashes])
+    crashes = [_list_crash(each) or nobody for each in report.crashes]
+    write_failures(folder, space, report.estimate.failures, crashes, kinds.others_listed)
     for name in (run_folder.FAULTS, run_folder.FAULT_BLOCKS, *run_folder.PICTURES):
         (folder / name).unlink(missing_ok=True)
     if faults:
@@ -218,11 +220,21 @@ def _list_crash(crash: dict[str, Any] | None) -> tuple[Any, ...]:
 
 
 def write_failures(
-    folder: Path, space: ScenarioSpace, failures: samplers.Failures, crashes: Sequence[tuple[Any, ...]] = ()
+    folder: Path,
+    space: ScenarioSpace,
+    failures: samplers.Failures,
+    crashes: Sequence[tuple[Any, ...]] = (),
+    others: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> None:
-    """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and the columns `CRASH` if known."""
-    rows = [(one.f, one.log_p0, *crash) for one, crash in zip(failures, crashes or [()] * len(failures), strict=True)]
-    names = ("f", "log_p0", *(run_folder.CRASH if crashes else ()))
+    """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and the columns `CRASH` if known.
+
+    Then f with other drivers in the ego's place, as "f_human"; the cell is empty where it did not drive.
+    """
+    f_others = [["" if np.isnan(f) else f for f in each.tolist()] for each in others.values()]
+    beside = list(zip(*f_others, strict=True)) or [()] * len(failures)
+    parts = zip(failures, crashes or [()] * len(failures), beside, strict=True)
+    rows = [(one.f, one.log_p0, *crash, *f) for one, crash, f in parts]
+    names = ("f", "log_p0", *(run_folder.CRASH if crashes else ()), *(f"f_{name}" for name in others))
     _write_table(folder / run_folder.FAILURES, space, failures.x, names, rows)
 
 

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from typer.testing import Result
 
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.study import Question, Report, severity_curve
+from rare_envs.egos.needs import RULE_BASED_EGOS
+from rare_envs.study import Question, Report, prepare, run, severity_curve
 from rare_envs.study.episodes import digest_scenarios
 from rare_envs.study.failures import (
     classify_failures,
@@ -154,6 +157,42 @@ def test_each_failure_of_the_list_has_its_crash_and_shares_add_up(
     found = read_failures(tmp_path)
     assert list(found)[-len(CRASH) :] == list(CRASH)
     assert np.array_equal(np.isnan(found["delta_v_struck"]), found["crash"] == "none")
+
+
+def test_an_attentive_driver_does_again_what_it_did_and_avoids_what_a_coasting_ego_hits(
+    cli: Callable[..., Result], tmp_path: Path, risky: str
+) -> None:
+    def fails(ego: str, *more: str) -> dict[str, dict[str, float]]:
+        out = tmp_path / ego
+        asked = ("--method", "mc", "--max-sim", 200, "--horizon", 3, "--seed", 0)
+        done = cli("estimate", FOLLOWING, "--ego", ego, "--base", risky, "--out", out, *asked, *more)
+        assert done.exit_code == 0, done.stderr
+        result, listed = json.loads((out / "result.json").read_text()), read_failures(out)
+        assert ("avoids" in done.stdout) == (ego != "human")
+        for name, each in result["other_drivers"].items():  # every failure weighs the same, and is in the list
+            assert each["fails"] == pytest.approx(np.mean(listed[f"f_{name}"] <= result["gamma"]), abs=0.03)
+            assert each["n"] == result["n_failures"]
+        assert result["n_sim"] == 200 and result["n_other_drivers"] >= 200 * len(result["other_drivers"])
+        for parts in (result["modes"], result["kinds"].values()):
+            weighed = sum(part["of_failures"] * part["other_drivers"]["human"]["fails"] for part in parts)
+            assert weighed == pytest.approx(result["other_drivers"]["human"]["fails"])
+        return result["other_drivers"]
+
+    assert fails("human", "--gamma", "2")["human"]["fails"] == 1.0
+    assert fails("idm", "--gamma", "2")["idm"]["fails"] == 1.0
+    coasting = fails("idm?max_deceleration=0.01")
+    assert coasting["human"]["fails"] < 0.2 and coasting["idm"]["fails"] < 0.2
+
+
+def test_what_other_drivers_do_is_not_known_where_they_cannot_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rare_envs.study.failures.OTHER_DRIVERS", ("idm?", "human"))
+    monkeypatch.setitem(RULE_BASED_EGOS, "idm?", None)
+    question = Question(env_id=CUT_IN, ego="idm", method="mc", max_sim=1000, gamma=0.5)
+    report = run(prepare(question))
+    assert set(report.kinds.find_others()) == {"human"}
+    assert any(note.startswith("what idm? would do is not known: ") for note in report.notes)
 
 
 def test_a_scenario_stands_once_in_the_list(report: Report) -> None:
