@@ -2,8 +2,8 @@
 
 Severity is P[collision with delta-v > v] over v, and the expected number of serious injuries. Failures of one kind of
 crash are one mode, unless they lie in regions apart: clusters of density (HDBSCAN) in standard normal space that
-together hold at least half of them. The rest belongs to the nearest cluster. Other drivers are put in the ego's place in
-failing scenarios of each mode, to tell whether a person would have avoided the crash.
+together hold at least half of them. The rest belongs to the nearest cluster. Other drivers are put in the ego's place
+in failing scenarios of each mode, to tell whether a person would have avoided the crash.
 
 References:
     Campello, Moulavi and Sander, "Density-based clustering based on hierarchical density estimates", PAKDD 2013.
