@@ -376,12 +376,19 @@ class StandardNormal:
         return u
 
 
+NO_FUNCTION = (
+    "This FunctionProblem has no f to simulate with: give it one, FunctionProblem(f, ...), or simulate elsewhere: "
+    "run = samplers.Auto().start(problem), x = run.ask(), run.tell(f)."
+)
+
+
 @dataclass(frozen=True, repr=False)
 class FunctionProblem:
-    """Any vectorised function, under N(0, I) or another base distribution.
+    """Any vectorised function, under N(0, I) or another base distribution; or its inputs alone, for ask and tell.
 
     Args:
-        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. Left out where there are `terms`.
+        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. Leave it out if there are `terms`,
+            or if simulations are made elsewhere: `start` of a method then needs `dim` or `base` only.
         dim: Number of dimensions d; may be left out where the base has one.
         terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system; None for
             none. The problem's own `terms` gives `Terms`.
@@ -395,7 +402,7 @@ class FunctionProblem:
         column_names: Names of the columns of x, for tables; by default those of an OpenTURNS distribution.
 
     Raises:
-        ValueError: If an argument is not as described, or f and terms are missing both.
+        ValueError: If an argument is not as described.
 
     Example:
         >>> import numpy as np, samplers
@@ -412,6 +419,9 @@ class FunctionProblem:
         >>> series = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)  # fails where either coordinate exceeds 3
         >>> series.terms(np.array([[4.0, 0.0]])).values
         array([[-1.,  3.]])
+        >>> run = samplers.MonteCarlo(n=100).start(samplers.FunctionProblem(base=[strength, load]), seed=0)
+        >>> run.ask().shape  # told by run.tell(f), whoever simulates
+        (100, 2)
     """
 
     f: Callable[[FloatArray], ArrayLike] | None = None
@@ -428,7 +438,7 @@ class FunctionProblem:
 
     def __post_init__(self) -> None:
         """Check the arguments; the functions of terms and gradients become those of the protocols."""
-        if not (callable(self.f) or (self.f is None and self.terms is not None)):
+        if not (self.f is None or callable(self.f)):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
         self._set_base()
         names = self.column_names or getattr(self.base, "column_names", ())
@@ -455,7 +465,9 @@ class FunctionProblem:
         check_whole("dim", self.dim, 1)
 
     def __repr__(self) -> str:
-        what = "terms" if self.f is None else getattr(self.f, "__name__", type(self.f).__name__)  # a user's function
+        what = "inputs alone" if self.terms is None else "terms"
+        if self.f is not None:
+            what = getattr(self.f, "__name__", type(self.f).__name__)  # a user's function
         base = "" if isinstance(self.base, StandardNormal) else f", base {type(self.base).__name__}"
         return f"<FunctionProblem of {what}, {self.dim} dimension{'s' * (self.dim != 1)}{base}>"
 
@@ -463,9 +475,11 @@ class FunctionProblem:
         """Call f on the rows of x (n, d); return its values as float64.
 
         Raises:
-            ValueError: If x is not of shape (n, d), or f does not return one number per row.
+            ValueError: If x is not of shape (n, d), f does not return one number per row, or there is no f.
         """
         _check_points(x, self.dim)
+        if self.f is None and self.terms is None:
+            raise EvaluationError(NO_FUNCTION)
         if self.f is None:
             return np.asarray(self.terms(x).f)
         if not self.vectorized:

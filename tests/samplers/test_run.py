@@ -20,13 +20,7 @@ from samplers.replicate import combine
 from samplers.run import Progress, Run, RunArguments
 from samplers.sample import Status, binomial_cov, clopper_pearson
 
-EASY = half_space(2, 2.0).problem
-
-
-class Places:
-    """What `start` needs of a problem: no f."""
-
-    dim, base = 2, samplers.distributions.StandardNormal(2)
+EASY, INPUTS = half_space(2, 2.0).problem, samplers.FunctionProblem(dim=2)
 
 
 def finished(run, f=EASY.f):
@@ -41,11 +35,17 @@ ALL = {"gamma": 0.5, "target_cov": 0.2, "confidence": 0.8, "on_error": "bound"}
 @pytest.mark.parametrize(("method", "more"), [("mc", ALL), ("mc", {}), ("ce", {}), ("adss", {}), ("two-stage", {})])
 def test_gives_what_estimate_gives(method, more):
     chosen, options = samplers.methods.get_method(method), {"seed": 3, "replicates": 3, "max_sim": 4501, **more}
-    assert finished(chosen.start(Places(), **options)) == samplers.estimate(EASY, chosen, **options)
+    assert finished(chosen.start(INPUTS, **options)) == samplers.estimate(EASY, chosen, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"on_error": "failure"}, {"workers": 2}])
+def test_inputs_alone_cannot_be_simulated(options):
+    with pytest.raises(EvaluationError, match=r"^This FunctionProblem has no f [^\n]*\.start\(problem\)[^\n]*$"):
+        samplers.estimate(INPUTS, "mc", seed=0, max_sim=100, **options)
 
 
 def test_the_same_batch_until_it_is_told_right():
-    run = samplers.MonteCarlo(n=5, batch=3).start(Places(), seed=1)
+    run = samplers.MonteCarlo(n=5, batch=3).start(INPUTS, seed=1)
     with pytest.raises(RuntimeError, match=r"call ask\(\)"):
         run.tell([1.0] * 3)
     first, again = run.ask(), run.ask()
@@ -65,9 +65,9 @@ def test_the_same_batch_until_it_is_told_right():
 
 
 def test_progress_and_a_result_at_any_moment():
-    unknown = samplers.MonteCarlo().start(Places(), seed=1, replicates=3).result()
+    unknown = samplers.MonteCarlo().start(INPUTS, seed=1, replicates=3).result()
     assert (unknown.p, unknown.interval, unknown.cov, unknown.status) == (0.0, (0.0, 1.0), math.inf, "stopped")
-    run = samplers.MonteCarlo(batch=10).start(Places(), max_sim=100, seed=1)
+    run = samplers.MonteCarlo(batch=10).start(INPUTS, max_sim=100, seed=1)
     assert (run.progress.n_sim, run.progress.max_sim) == (0, 100)
     run.tell(EASY.f(run.ask()))
     assert run.progress.n_sim == 10
@@ -94,7 +94,7 @@ class Asks(samplers.methods.Method):
 
 @pytest.mark.parametrize("goes_on", [False, True])
 def test_a_method_that_cannot_be_interrupted_leaves_p_unknown(goes_on):
-    run = Asks(np.zeros((10, 2)), goes_on).start(Places(), seed=1)
+    run = Asks(np.zeros((10, 2)), goes_on).start(INPUTS, seed=1)
     run.tell(run.ask()[:, 0])
     result = run.result()
     assert (result.n_sim, result.status) == (10, "stopped")
@@ -105,9 +105,9 @@ def test_a_method_that_cannot_be_interrupted_leaves_p_unknown(goes_on):
 def test_a_method_must_ask_for_points_and_return_an_outcome():
     for shape in ((3,), (3, 5), (1, 3, 2)):
         with pytest.raises(ValueError, match=r"Expected x of shape \(n, 2\)"):
-            Asks(np.zeros(shape)).start(Places())
+            Asks(np.zeros(shape)).start(INPUTS)
     with pytest.raises(TypeError, match="Expected the steps of the method to return an Outcome"):
-        finished(Asks(np.zeros((1, 2))).start(Places()))
+        finished(Asks(np.zeros((1, 2))).start(INPUTS))
 
 
 @pytest.mark.parametrize(("method", "max_sim"), [("adss", None), ("mc", 6000), ("two-stage", 6000)])
