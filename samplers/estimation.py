@@ -90,7 +90,8 @@ def estimate(
 
     Args:
         problem: Has `dim`, `base` and `evaluate`; see `Problem`.
-        method: A method with its settings, or the name of one (`METHODS`); by default `Auto` chooses one.
+        method: A method with its settings, the name of one (`samplers.methods.METHODS`), or "module:Class" for one of
+            yours; by default `Auto` chooses one.
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.

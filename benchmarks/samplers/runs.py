@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import math
 import platform
 import time
@@ -22,8 +21,9 @@ from threadpoolctl import threadpool_limits
 from benchmarks.samplers.limit_states import PointFunction
 from benchmarks.samplers.other_libraries import OTHER_SOLVERS, Solver
 from benchmarks.samplers.problems import find_problem, limit_state
+from rare_envs.plugins import import_object
 from samplers import Estimate, estimate
-from samplers.methods import METHODS, Stepping
+from samplers.methods import METHODS, Stepping, get_method
 from samplers.problem import FloatArray
 
 _Job = TypeVar("_Job")
@@ -142,16 +142,8 @@ def find_method(name: str) -> Stepping | Solver:
                 f"Unknown method {name!r}; known: {', '.join([*METHODS, *OTHER_SOLVERS])}, module:attribute."
             )
         return METHODS[name]()
-    module, _, attribute = name.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"Cannot load the method {name}: {error}") from None
-    if isinstance(found, type):
-        found = found()
-    if not isinstance(found, Stepping) and not callable(found):
-        raise ValueError(f"Expected {name} to be a method or a function, got {type(found).__name__}.")
-    return found  # type: ignore[no-any-return]  # either, by now
+    found = import_object(name, f"the method {name!r}")
+    return found if callable(found) and not isinstance(found, type) else get_method(name)
 
 
 def run_once(job: Job) -> MethodRun:

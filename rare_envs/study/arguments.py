@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from rare_envs.files import read_text_file
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import did_you_mean, import_object
 from rare_envs.scenarios.registry import find_scenario, split_layout
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ class Question:
     horizon: float | None = arg(None, "Length of an episode in seconds.")
     noise: bool | str = arg(True, "The drivers' noise: part of x, one fixed sequence, none.")
     weather: bool = arg(False, "Make weather and the camera's noise parameters.")
-    method: str = arg("auto", "Estimation method; see rare-envs list methods.")
+    method: str = arg("auto", "Estimation method (see rare-envs list methods), or module:Class.")
     measure: str = arg("ttc", "Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
     gamma: float = arg(0.0, "Threshold: P[f <= gamma]; 0 counts collisions.")
     seed: int = arg(0, "Seed; the same seed gives the same answer.", count=True)
@@ -262,15 +262,23 @@ class Question:
 
     def check(self) -> Stepping:
         """Return the method, after a check of all that is known before the ego is loaded, which takes seconds."""
-        import samplers
         from samplers.problem import check_whole
 
         _ = self.run_arguments
         if self.chunk is not None:
             check_whole("chunk", self.chunk, 1)
-        method = samplers.methods.get_method(self.method)
+        method = find_method(self.method)
         find_scenario(self.env_id)
         return method
+
+
+def find_method(name: str) -> Stepping:
+    """Return a method with its defaults, by its name or as module:Class; the working directory is searched too."""
+    from samplers.methods import get_method
+
+    if ":" in name:
+        import_object(name, f"the method {name!r}")
+    return get_method(name)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,15 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import __version__
 from rare_envs.study import arguments, writing
-from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
+from rare_envs.study.arguments import (
+    BadInput,
+    Question,
+    RunInterrupted,
+    UnwrittenResults,
+    as_bad_input,
+    find_method,
+    output_folder,
+)
 from rare_envs.study.ego_check.checks import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures, drive_by_others
@@ -487,11 +495,13 @@ def compare_egos(
 
 def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.analysis.PlannedRun, ...]:
     """Return what the method of a run, of which result.json holds this, and plain Monte Carlo need."""
-    described = recorded.get("method")
+    described, asked = recorded.get("method"), recorded.get("question")
     name = described.get("name") if isinstance(described, Mapping) else None
+    if isinstance(asked, Mapping) and ":" in str(asked.get("method")):
+        name = asked["method"]
     p, cov, n_sim, seconds = (_read_number(recorded, each) for each in ("p", "cov", "n_sim", "seconds"))
     with as_bad_input(ValueError):
-        method = samplers.methods.get_method(name if isinstance(name, str) else reprlib.repr(name))
+        method = find_method(name if isinstance(name, str) else reprlib.repr(name))
         final = None if recorded.get("final_draws") is None else int(_read_number(recorded, "final_draws"))
         if final is not None and final > n_sim:
             raise ValueError(f"The result says {final} final draws of {n_sim:g} simulations.")
@@ -508,7 +518,7 @@ def plan_by_pilots(
     """Run a pilot by each method, and return what each needs; plain Monte Carlo last."""
     found: dict[str, samplers.analysis.PlannedRun] = {}
     with as_bad_input(ValueError):
-        chosen = {name: samplers.methods.get_method(name) for name in methods}  # before a pilot, which may take hours
+        chosen = {name: find_method(name) for name in methods}  # before a pilot, which may take hours
     study = prepare(replace(question, method=methods[0], ensemble_run=False))
     for name, method in chosen.items():
         with as_bad_input(ValueError):

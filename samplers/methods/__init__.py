@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
+from pkgutil import resolve_name
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -191,33 +192,69 @@ register_stored(*(METHODS[name] for name in METHODS.own))
 def get_method(name: str, **settings: Any) -> Stepping:
     """Return the method of that name with the given settings.
 
+    Args:
+        name: One of `METHODS`, or "module:Class" for a class of your own with the protocol of `Method`, or
+            "module:object" for an object of one, which has its settings.
+        **settings: Fields of the class; those left out have its defaults, or what the object has.
+
     Raises:
-        ValueError: If the name or a setting is not known (the nearest one is suggested) or a
-            setting has a value out of range.
+        ValueError: If the name or a setting is not known (the nearest one is suggested), a setting has a value out of
+            range, or there is no method in that place.
 
     Example:
         >>> import samplers
         >>> samplers.methods.get_method("mc", n=5000)
         MonteCarlo(n=5000, batch=10000)
+        >>> samplers.methods.get_method("samplers.methods.cross_entropy:CrossEntropy", n=500).n
+        500
     """
-    if not isinstance(name, str) or name not in METHODS:
-        check_name("method", name, list(METHODS))
-    cls = METHODS[name]
+    if isinstance(name, str) and ":" in name:
+        found = _import_method(name)
+    else:
+        if not isinstance(name, str) or name not in METHODS:
+            check_name("method", name, [*METHODS, "module:Class"])
+        found = METHODS[name]
+    cls = found if isinstance(found, type) else type(found)
     for setting in settings:
         check_name(f"setting of {cls.__name__}", setting, list(inspect.signature(cls).parameters))
-    return cls(**settings)
+    if not isinstance(found, type):
+        return replace(cast(Any, found), **settings) if settings else found
+    try:
+        return cls(**settings)
+    except ValueError:
+        raise
+    except Exception as error:  # of a user's class
+        hint = f"if it needs settings, name an object that has them, as tuned = {cls.__name__}(...) in its module"
+        raise ValueError(f"Cannot make the method {name!r}: {_describe(error)}; {hint}.") from error
+
+
+def _import_method(place: str) -> type[Stepping] | Stepping:
+    """Return the class or object in a place module:name."""
+    try:
+        found = resolve_name(place)
+        return found if isinstance(found, Stepping) and not isinstance(found, type) else _check_class(found)
+    except Exception as error:  # the module is the user's: anything may happen in it
+        raise ValueError(f"Cannot use the method {place!r}: {_describe(error)}.") from error
+
+
+def _describe(error: Exception) -> str:
+    """Return an error of a user's module in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split()).rstrip('.')}"
+
+
+def _check_class(cls: Any) -> type[Stepping]:
+    """Return what a user says is a method; raise a TypeError that says what it lacks unless it is the class of one."""
+    if not isinstance(cls, type):
+        raise TypeError(f"expected a class, got {cls!r}")
+    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(cls, name)]
+    if missing:
+        raise TypeError(f"the class {cls.__name__} has no {', '.join(missing)}")
+    return cast(type[Stepping], cls)
 
 
 def _load_method(entry: EntryPoint) -> type[Stepping]:
     """Import the class that an entry point names."""
-    cls: Any = entry.load()
-    if not isinstance(cls, type):
-        raise TypeError(f"expected a class, got {cls!r}")
-    # another package's class: the message says which it lacks
-    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(cls, name)]
-    if missing:
-        raise TypeError(f"the class {cls.__name__} has no {', '.join(missing)}")
-    found = cast(type[Stepping], cls)
+    found = _check_class(entry.load())
     if found.name != entry.name:
         raise ValueError(f"the class {found.__name__} is named {found.name!r}, its entry point {entry.name!r}")
     return found

@@ -1,6 +1,7 @@
 """Methods of other packages, found by entry point."""
 
 import json
+import re
 import sys
 import textwrap
 import warnings
@@ -10,7 +11,7 @@ from typer.testing import CliRunner
 
 import samplers
 from rare_envs.study.cli.app import app
-from samplers.methods import ENTRY_POINT_GROUP, METHODS, Methods
+from samplers.methods import ENTRY_POINT_GROUP, METHODS, Methods, get_method
 from samplers.testing import check_method
 
 LATTICE = """
@@ -45,7 +46,12 @@ LATTICE = """
             yield
 
 
-    NUMBER = 3
+    class Sized(Lattice):
+        def __init__(self, n):
+            object.__setattr__(self, "n", n)
+
+
+    NUMBER, SMALL = 3, Lattice(n=50)
     """
 
 
@@ -117,6 +123,33 @@ def test_one_that_cannot_be_used_is_named_and_left_out(installed, name, value, s
         assert list(methods) == METHODS.own  # said once
 
 
+def test_a_method_is_named_by_its_place(installed):
+    installed()
+    problem = samplers.limit_states.half_space(2, 1.0).problem
+    assert samplers.estimate(problem, "lattice_methods:Lattice", seed=1).n_sim == 2000
+    assert samplers.estimate(problem, "lattice_methods:SMALL", seed=1).n_sim == 50
+    assert [get_method(f"lattice_methods:{name}", n=7).n for name in ("Lattice", "SMALL", "Sized")] == [7, 7, 7]
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("no_such_module:Lattice", "No module named 'no_such_module'"),
+        ("lattice_methods:Lettuce", "lattice_methods.*Lettuce"),
+        ("lattice_methods:NUMBER", "expected a class, got 3"),
+        ("lattice_methods:Nameless", "class Nameless has no name, stops_at_target"),
+        ("lattice_methods:Sized", "Sized.__init__.* missing .*'n'; .* tuned = Sized\\(...\\)"),
+        ("lattice_methods.Lattice", "Valid: auto, .*module:Class"),
+    ],
+)
+def test_a_place_without_a_method_is_one_line(installed, place, said):
+    installed()
+    with pytest.raises(ValueError, match=f"^[^\n]*{place}[^\n]*{said}[^\n]*$"):
+        get_method(place)
+    refused = command_line("estimate", "CarFollowing", "--method", place)
+    assert refused.exit_code == 2 and refused.stderr.count("\n") == 1 and re.search(said, refused.stderr)
+
+
 def command_line(*words):
     return CliRunner().invoke(app, words)
 
@@ -131,6 +164,8 @@ def test_the_command_line_knows_it(installed):
     assert "'broken' of lattice-methods" in run.stderr
     answer = json.loads(run.stdout)
     assert (answer["method"]["name"], answer["n_sim"]) == ("lattice", 2000)
+    by_place = json.loads(command_line("estimate", env, "--method", "lattice_methods:SMALL", "--json").stdout)
+    assert (by_place["method"]["name"], by_place["n_sim"]) == ("lattice", 50)
     assert "Plain draws under another name." in command_line("list", "methods").stdout
     assert "lattice" in command_line("list").stdout
     refused = command_line("estimate", env, "--method", "lattic")

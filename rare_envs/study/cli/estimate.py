@@ -18,6 +18,7 @@ from rare_envs.study.arguments import (
     ExecutorOptions,
     Question,
     as_bad_input,
+    find_method,
     read_mapping,
     read_question_file,
 )
@@ -135,7 +136,7 @@ def estimate_highway_env(
         raise BadInput(f"There is a finished run in {str(out)!r} ({ESTIMATE_FILE}): replace it by --force.")
     names = ("gamma", "seed", "max_sim", "target_cov", "replicates", "on_error")
     with as_bad_input(ValueError, OSError, TypeError):
-        method = samplers.methods.get_method(question.method)
+        method = find_method(question.method)
         arguments = {name: getattr(question.run_arguments, name) for name in names}
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         settings: dict[str, Any] = {"config": config}
