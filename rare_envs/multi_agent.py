@@ -14,6 +14,7 @@ from rare_envs.simulation.decision import (
     COLLISION_COST,
     RewardTerms,
     hold_finished,
+    read_terms,
     reward_terms,
     run_ticks,
 )
@@ -21,7 +22,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import Driver, World
 from rare_envs.traffic.bodies import overlaps, select_pairs
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import State, map_leaves
+from rare_envs.traffic.state import State
 
 __all__ = ["AdversaryTerms", "Transition", "adversary_reward", "own_reward", "play"]
 
@@ -127,8 +128,8 @@ class Transition(NamedTuple):
 
 
 Reward: TypeAlias = Callable[[Transition], Any]
-"""From a transition to a reward: a tensor (B,), a number for all episodes, or a named tuple of such terms with their
-sum as `total`."""
+"""From a transition to a reward: a tensor (B,), a number for all episodes, or a named tuple of such terms, whose
+sum it is."""
 
 
 def own_reward(transition: Transition) -> RewardTerms:
@@ -153,7 +154,7 @@ class AdversaryTerms(NamedTuple):
 
     Example:
         >>> import torch
-        >>> float(AdversaryTerms(*torch.tensor([[0.5], [0.0], [-0.25], [-0.125], [0.0]])).total)
+        >>> float(sum(AdversaryTerms(*torch.tensor([[0.5], [0.0], [-0.25], [-0.125], [0.0]]))))
         0.125
     """
 
@@ -167,11 +168,6 @@ class AdversaryTerms(NamedTuple):
     """-0.5 (offset from the centre of the nearest lane / half a lane)^2."""
     fault: Tensor
     """-30 in the tick in which it collides with anything but the ego: the road's edge or another vehicle."""
-
-    @property
-    def total(self) -> Tensor:
-        """The reward, shape (B,)."""
-        return self.danger + self.collision + self.comfort + self.lane + self.fault
 
 
 def adversary_reward(transition: Transition) -> AdversaryTerms:
@@ -200,27 +196,6 @@ def adversary_reward(transition: Transition) -> AdversaryTerms:
         lane=own.lane,
         fault=-COLLISION_COST * alone.to(danger.dtype),
     )
-
-
-def total_of(reward: Any) -> Tensor:
-    """Return the sum (B,) of a reward of `step_agents`."""
-    total: Tensor = reward if isinstance(reward, Tensor) else reward.total
-    return total
-
-
-def _read_reward(reward: Any, like: Tensor) -> Any:
-    """Return what a reward function gave as floating-point tensors (B,), `like` another; else a ValueError."""
-
-    def read(term: Any) -> Tensor:
-        try:
-            value = torch.as_tensor(term)
-        except (TypeError, ValueError, RuntimeError):
-            value = torch.empty(0, 0)  # of no shape that fits
-        if value.shape not in ((), like.shape):
-            raise ValueError(f"Expected a reward of shape (B,), a number, or terms with a `total`, got {reward!r}.")
-        return value if value.ndim and value.is_floating_point() else value.to(like).expand(like.shape)
-
-    return map_leaves(read, reward) if hasattr(reward, "total") else read(reward)
 
 
 def command_nobody(world: World, batch: int) -> tuple[Tensor, Tensor]:
@@ -253,7 +228,7 @@ def step_agents(
         earned = []
         for j, reward in rewards.items():
             given = reward(Transition(before, after, j, physical[:, j]))
-            earned.append((_read_reward(given, traffic.state.x[:, 0]), before.views[j].collided))
+            earned.append((read_terms(given, traffic.state.x[:, 0]), before.views[j].collided))
         return after, earned
 
     end, means = run_ticks(world.clock, episode, action, tick)

@@ -27,8 +27,9 @@ from rare_envs.envs.rows_and_infos import (
     to_object_rows,
 )
 from rare_envs.make import set_up
-from rare_envs.multi_agent import MultiAgentEpisode, Reward, command_nobody, own_reward, start, step_agents, total_of
+from rare_envs.multi_agent import MultiAgentEpisode, Reward, command_nobody, own_reward, start, step_agents
 from rare_envs.plugins import check_name
+from rare_envs.simulation.decision import total_of
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds, observe, read_kinds
 

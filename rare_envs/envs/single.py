@@ -14,11 +14,18 @@ from numpy.typing import NDArray
 
 from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.envs.rendering import RENDER_MODES, Renderer, make_scene
-from rare_envs.envs.rows_and_infos import SingleObservation, StatesLength, episode_info, step_info, take_step
+from rare_envs.envs.rows_and_infos import (
+    SingleObservation,
+    StatesLength,
+    episode_info,
+    open_reward,
+    step_info,
+    take_step,
+)
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import CONFIGURATION_ARGUMENTS, set_up
 from rare_envs.plugins import check_name
-from rare_envs.simulation.decision import COLLISION_COST
+from rare_envs.simulation.decision import COLLISION_COST, total_of
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds, observe
 
@@ -70,7 +77,9 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
 
-    def __init__(self, env_id: str, render_mode: str | None = None, core: str = "auto", **kwargs: Any) -> None:
+    def __init__(
+        self, env_id: str, render_mode: str | None = None, core: str = "auto", reward: Any = None, **kwargs: Any
+    ) -> None:
         """Make the environment.
 
         Args:
@@ -78,6 +87,7 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
             render_mode: None, "rgb_array" or "human".
             core: What carries out the steps, "torch" or "numba" (compiled, for scripted scenarios); "auto" for the
                 compiled ones where they can be had. They differ by rounding.
+            reward: What to reward, see `rare_envs.simulation.decision.find_reward`.
             **kwargs: See `rare_envs.make.set_up`.
         """
         world, self.space = set_up(env_id, **kwargs)
@@ -91,6 +101,7 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
         self._episode: Episode | None = None
         self._tick, self._last_tick = 0, self.world.clock.ticks
         self._compiled = find_scripted_step(self.world, core)
+        self._reward = open_reward(reward, self.world, self.space)
         self._between = False
         self._recorder: Any = None
 
@@ -132,13 +143,14 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
         watched = self.world.clock.stride > 1 and (self._recorder or self._renderer.is_window)
         watch = self._watch if watched else None
         with torch.inference_mode():
+            how = {"watch": watch, "reward": self._reward}
             given = np.asarray(action)[None]
-            episode, terms, features = take_step(self.world, self._compiled, self._episode, given, watch=watch)
+            episode, terms, features = take_step(self.world, self._compiled, self._episode, given, **how)
             if features is not None and self.world.sensing.observation == "features":
                 observation: SingleObservation = features[0]
             else:
                 observation = self._observe(episode)
-            reward = float(terms.total)
+            reward = float(total_of(terms))
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)
         truncated = not terminated and self._tick >= self._last_tick

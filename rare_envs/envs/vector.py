@@ -25,13 +25,14 @@ from rare_envs.envs.rows_and_infos import (
     list_tensors,
     mask_infos,
     merge_rows,
+    open_reward,
     take_step,
     to_object_rows,
 )
 from rare_envs.fast.choice import find_scripted_step
 from rare_envs.make import set_up
 from rare_envs.plugins import check_name
-from rare_envs.simulation.decision import RewardTerms
+from rare_envs.simulation.decision import name_terms, total_of
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds, observe
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
@@ -62,6 +63,7 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
         max_episode_steps: int | None = None,
         core: str = "auto",
         device: str = "cpu",
+        reward: Any = None,
         **kwargs: Any,
     ) -> None:
         """Make the batch.
@@ -76,6 +78,7 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
                 compiled ones where they can be had. They differ by rounding.
             device: Where torch carries them out: "cpu", or a GPU, such as "cuda". Observations and rewards are arrays
                 as ever.
+            reward: What to reward, see `rare_envs.simulation.decision.find_reward`.
             **kwargs: See `rare_envs.make.set_up`.
         """
         steps = sys.maxsize if max_episode_steps is None else max_episode_steps
@@ -93,6 +96,7 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
         world, self.space = set_up(env_id, **kwargs)
         if self.device.type != "cpu":
             world = replace(world, background=move_to(self.device, world.background))
+        self._reward = open_reward(reward, world, self.space)
         self.world = world.with_statistics()
         fps = self.world.clock.decisions_per_second
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self._mode}
@@ -201,10 +205,12 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
         started = self._replace(rows) if len(rows) else None
         with torch.inference_mode():
             ignored = fresh if len(rows) else None
-            episode, terms, features = take_step(self.world, self._compiled, self._episode, actions, ignored)
+            episode, terms, features = take_step(
+                self.world, self._compiled, self._episode, actions, ignored, reward=self._reward
+            )
             if started is not None:  # which do not move in the step that starts them
                 episode, features = merge_rows(episode, self._place(rows), started), None
-            reward = terms.total.double().numpy(force=True)
+            reward = total_of(terms).double().numpy(force=True)
         reward[fresh] = 0.0
         self._episode = episode
         self._tick += np.where(fresh, 0, self.world.clock.stride)
@@ -216,12 +222,12 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
         return observation, reward, terminated.copy(), truncated, infos
 
     def _finish(
-        self, observation: Any, terms: RewardTerms, done: NDArray[np.bool_], fresh: NDArray[np.bool_]
+        self, observation: Any, terms: Any, done: NDArray[np.bool_], fresh: NDArray[np.bool_]
     ) -> tuple[Any, Info]:
         """Return observations and infos after a step, and replace what ended if that is to be in the same step."""
         assert self._episode is not None
         episode, infos, everyone = self._episode, Info(), np.ones(self.num_envs, dtype=bool)
-        earned = {"reward_terms": {name: each.double().numpy(force=True) for name, each in terms._asdict().items()}}
+        earned = {"reward_terms": {name: each.double().numpy(force=True) for name, each in name_terms(terms).items()}}
         if self._mode != AutoresetMode.SAME_STEP:
             self._ended = done.copy()
             end = self._end_info(episode, done) if done.any() else {}

@@ -1,5 +1,7 @@
 """Environments of one and batched: their agreement, autoreset, infos, reset options, and scenarios drawn ahead."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -168,3 +170,54 @@ def test_a_generator_that_others_draw_from_too_is_not_put_back(kind: type[np.ran
     others = rng.random(5)
     ahead.settle()
     assert not np.isin(rng.random(10 * ROWS_AHEAD), others).any()
+
+
+def spare(step: Any) -> Any:
+    """A reward of the user's."""
+    return 0.05 * step.speed - 10.0 * step.collision
+
+
+WEIGHTS = {"speed": 1.0, "effort": -0.1, "lane": -0.5, "risk": -1.0, "headway": -0.5, "collision": -30.0}
+
+
+@pytest.mark.parametrize("reward", [spare, WEIGHTS, f"{__name__}:spare"], ids=["function", "weights", "name"])
+@pytest.mark.parametrize("action", ["continuous", "meta"])
+def test_a_reward_of_ones_own_is_the_same_in_one_environment_and_in_a_batch(reward: Any, action: str) -> None:
+    batch = rare_envs.make_batch("rare_envs/CutIn-v0", 3, reward=reward, action=action)
+    batch.reset(seed=[0, 1, 2])
+    single = gym.make("rare_envs/CutIn-v0", reward=reward, action=action)
+    standard = gym.make("rare_envs/CutIn-v0", action=action)
+    chosen = np.int64(3) if action == "meta" else np.array([0.5, 0.1], np.float32)
+    single.reset(seed=1), standard.reset(seed=1)
+    over = False
+    while not over:
+        _, earned, over, cut, info = single.step(chosen)
+        assert batch.step(np.stack([chosen] * 3))[1][1] == earned
+        if reward is WEIGHTS:  # which are those of the reward that nobody asked for
+            assert earned == pytest.approx(standard.step(chosen)[1], abs=1e-5)
+        elif action == "continuous":
+            assert earned == pytest.approx(0.05 * info["speed"] - 10.0 * info["collision"], abs=1e-5)
+        over = over or cut
+    assert info["collision"]
+
+
+def test_terms_have_the_names_of_highway_env_and_others_are_refused() -> None:
+    given = {"collision_reward": -1.0, "right_lane_reward": 0.1, "high_speed_reward": 0.4}
+    env = gym.make("rare_envs/HardBrake-v0", reward=given)
+    env.reset(options={"speed": 25.0, "gap": 30.0, "peak": 6.0, "loss": 20.0})
+    _, earned, *_, info = env.step(np.zeros(2))
+    assert info["reward_terms"] == pytest.approx({"collision": 0.0, "right_lane": 0.0, "high_speed": 0.2}, abs=1e-3)
+    assert earned == pytest.approx(0.2, abs=1e-3)
+    for wrong, said in (
+        (
+            {"speeed": 1.0},
+            r"^Unknown term of the reward 'speeed' \(did you mean 'speed'\?\); expected one of '",
+        ),
+        ({"speed": None}, "^Expected a finite number as the weight of 'speed' in the reward, got None"),
+        (3, "^Expected reward as weights by term, a function or 'module:function', got 3"),
+        (lambda step: step.sped, "AttributeError: .* 'sped'"),
+        (lambda step: step.speed[:1], r"^Expected a finite reward of shape \(2,\), a number, .* got array\("),
+    ):
+        with pytest.raises(ValueError, match=said) as refused:
+            rare_envs.make_batch("hard_brake", 4, reward=wrong)
+        assert "\n" not in str(refused.value)
