@@ -22,7 +22,6 @@ from agents.learned.networks import HUMAN_NOISE
 from agents.saved_ego import HUB_PREFIX, find_hub_model, load_saved_ego
 from agents.vision import load_vision
 from rare_envs.control.lane_changing import LaneChangingDriver
-from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.needs import RULE_BASED_EGOS, wrap_callable
 from rare_envs.plugins import EgoGone, as_errors, did_you_mean, import_object, is_policy, one_line, refuse_ego
 from rare_envs.startup import advise_install
@@ -78,17 +77,18 @@ def load_ego(
 
     Args:
         spec: "idm"; "human", an attentive human driver, or "human:no-headway-rule", who looks away for as long as it
-            likes; all with other parameters as "idm?time_headway=2&exponent=2" (fields of `rare_envs.IDM` and
+            likes; "cc_human", "alks", "fsm" or "rss", reference drivers (`rare_envs.egos.reference`); all with other
+            parameters as "idm?time_headway=2&exponent=2" (fields of `rare_envs.IDM` and
             `rare_envs.control.human_driver.HumanDriverModel`; a longer `reaction_time` alone makes contacts 100 to 300
             times as frequent, which people's are not); "imitation", the shipped ego with lidar; "vision", PilotNet on
             the front camera; "mgail" or "gail", drivers of the traffic, by their mean actions ("mgail?rules=0" by its
-            network alone); a path to a `.safetensors` with one of these
-            kinds, to a `.zip` saved by Stable-Baselines3, or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form);
-            "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub; `module:function`, a function without arguments
-            that returns an ego (modules in the working directory are found); `tcp://host:port` for an ego in another
-            program (docs/egos.md); `process:EGO`, any of these files and functions in a process of its own, which is
-            ended and started anew where the ego hangs or dies; `noisy:EGO`, any ego behind the imperfections of a full
-            stack (`agents.imperfect_stack.Stack`).
+            network alone); a path to a `.safetensors` with one of these kinds, to a `.zip` saved by Stable-Baselines3,
+            or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form); "hf:USER/REPOSITORY", such a `.zip` of the
+            Hugging Face Hub; `module:function`, a function without arguments that returns an ego (modules in the
+            working directory are found); `tcp://host:port` for an ego in another program (docs/egos.md); `process:EGO`,
+            any of these files and functions in a process of its own, which is ended and started anew where the ego
+            hangs or dies; `noisy:EGO`, any ego behind the imperfections of a full stack
+            (`agents.imperfect_stack.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
             a file that needs code of its author's is refused, and one to which everybody may write.
@@ -96,8 +96,9 @@ def load_ego(
             `<name>_vecnormalize.pkl` or `vecnormalize.pkl`.
 
     Returns:
-        Names of rule-based egos as they stand, with settings an `IDM` or a `HumanEgo`; a `LearnedEgo`, else an object
-        with `predict`. A `.zip` gives a `SavedEgo`, whose `observation_space` and `action_space` are the policy's.
+        Names of rule-based egos as they stand, with settings an `IDM`, a `HumanEgo` or a `ReferenceEgo`; a
+        `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose `observation_space` and
+        `action_space` are the policy's.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -166,8 +167,8 @@ def _load_rule_based(text: str, *_: Any) -> Any:
         return text
     try:
         ego = RULE_BASED_EGOS[name]
-        if isinstance(ego, HumanEgo):
-            return HumanEgo(replace(ego.model, **_read_settings(type(ego.model), query)))
+        if hasattr(ego, "model"):  # a human or reference driver
+            return replace(ego, model=replace(ego.model, **_read_settings(type(ego.model), query)))
         return replace(ego, **_read_settings(type(ego), query))
     except ValueError as error:
         raise ValueError(f"The ego {text!r}: {error}") from None

@@ -37,6 +37,7 @@ from rare_envs.egos.needs import (
     resolve,
 )
 from rare_envs.egos.policy import PolicyDriver, as_driver, find_device_driver
+from rare_envs.egos.reference import ReferenceDriver
 from rare_envs.egos.wrappers import find_normalisation_doubt
 from rare_envs.fast.choice import CORES, CompilerFails, is_compiled, leave_to_torch, simulate
 from rare_envs.make import refuse_unknown, set_up
@@ -60,7 +61,7 @@ from rare_envs.traffic.crash import CRASH_KINDS, Crash
 COMPILED_DRAWS = 300_000
 """Compiled rollouts of some seconds; without a failure among them p is below 1e-5."""
 TORCH_DRAWS = 100_000
-"""Rollouts of some seconds by torch, in which a human driver answers 20,000 to 40,000 a second."""
+"""Rollouts of some seconds by torch, in which a human or reference driver answers 20,000 to 40,000 a second."""
 
 
 class DrivingProblem:
@@ -200,7 +201,7 @@ class DrivingProblem:
         """Rollouts that are made of a stratum in which nothing failed, for its upper end: a matter of seconds."""
         if is_compiled(self.world, self.driver):
             return COMPILED_DRAWS
-        return TORCH_DRAWS if isinstance(self.driver, HumanDriver) else 0
+        return TORCH_DRAWS if isinstance(self.driver, HumanDriver | ReferenceDriver) else 0
 
     @property
     def notes(self) -> tuple[str, ...]:

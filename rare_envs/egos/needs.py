@@ -21,6 +21,7 @@ from gymnasium import spaces
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HUMAN_EGOS
+from rare_envs.egos.reference import REFERENCE_EGOS
 from rare_envs.egos.wrappers import find_action_bounds, find_frame_stacking
 from rare_envs.plugins import check_predict, is_policy, refuse_ego
 from rare_envs.simulation.observation import ELSEWHERE, OBSERVATIONS, map_kinds, observation_space, read_kinds
@@ -213,7 +214,7 @@ def name_ambiguities(action_space: Any, kinds: Collection[str]) -> tuple[str, ..
     return tuple(found)
 
 
-RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), **HUMAN_EGOS})
+RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), **HUMAN_EGOS, **REFERENCE_EGOS})
 """Egos that are known by a name."""
 
 
