@@ -7,8 +7,10 @@ share of -log p:
 
 The joint relative entropy of u given failure is exactly -log p, and the base of u is a product, so that the I_j add up
 to at most 1; the rest is what the columns do together. For a half-space {alpha . u >= beta} I_j tends to alpha_j^2, the
-importance factor of first-order reliability analysis, as beta grows. First-order Sobol indices of the indicator of
-failure, in contrast, are small wherever failure needs several columns at once.
+importance factor of first-order reliability analysis, as beta grows. If columns are correlated, u_j is column j given
+the columns before it, so that their order matters: these are the factors of FORM in the space of u (OpenTURNS calls
+them classical), not those of the columns themselves (elliptical, its default). First-order Sobol indices of the
+indicator of failure, in contrast, are small wherever failure needs several columns at once.
 
 D_j is computed from mean m and variance s^2 of u_j given failure as (m^2 + s^2 - 1 - log s^2) / 2: exact where u_j
 given failure is normal, and else a lower bound, since of all distributions with these moments the normal has most
@@ -49,6 +51,7 @@ import numpy as np
 
 from samplers.analysis.reweight import find_fitted_base, log_density, require_base, reweight_to_refits
 from samplers.analysis.weighted import Reported, WeightedFailures, weigh_failures
+from samplers.bases import ROUND_TRIP
 from samplers.method import EstimateData
 from samplers.output import drawing_axes
 from samplers.problem import Distribution, FloatArray
@@ -70,6 +73,8 @@ MIN_CORRELATION = 0.8
 """Correlation of log p to first order with log p over the refits below which no recording is recommended."""
 ENOUGH_POINTS = 30.0
 """Effective failing points below which importance and derivatives are called not determined."""
+RECOMBINED = 20
+"""Failing points whose columns are exchanged to see whether they are correlated."""
 SHOWN_PARAMETERS = 12
 """Rows of the table for people, and bars of the picture."""
 
@@ -81,8 +86,9 @@ class ColumnImportance(Reported):
     name: str
     """Name of the parameter."""
     importance: float
-    """D over -log p: the share of how rare failure is that the parameter has by itself, 0 to 1; the estimate from few
-    points, which may be beyond, is cut to that range."""
+    """Relative entropy of u_j given failure over -log p: the share of how rare failure is that the parameter has by
+    itself, 0 to 1; the estimate from few points, which may be beyond, is cut to that range. See
+    `Sensitivity.conditional` for how it ranks beside the factors of FORM."""
     error: float
     """Standard error of `importance`."""
     direction: float
@@ -133,6 +139,10 @@ class Sensitivity(Reported):
     """By parameter of x, the most important first."""
     points: float = math.inf
     """Effective number of failing points that all of it rests on."""
+    conditional: bool = False
+    """Whether columns of x are correlated, so that u_j is column j given the columns before it. Importance then depends
+    on their order, and FORM's factors of the columns themselves may rank them otherwise; else these agree with it, for
+    small p and a smooth limit state."""
     shares: Mapping[str, float] = field(default_factory=dict)
     """Share of the spread of log p over the refits by parameter of x, the largest first; a correlation counts half for
     each of the two. Empty where the base has no refits."""
@@ -153,7 +163,9 @@ class Sensitivity(Reported):
         shown = self.parameters[:SHOWN_PARAMETERS]
         names = [each.name for each in self.columns] + [each.name for each in shown]
         width = max(len(head), *(len(name) + 2 for name in names))
-        lines = ["importance of the parameters of x (share of -log p; mean of u given failure)"]
+        lines = ["importance (relative entropy of u_j given failure / -log p); mean of u_j"]
+        note = "correlated inputs: u_j is input j given those before; FORM may rank otherwise"
+        lines += [note] * self.conditional
         lines += [
             f"{'  ' + each.name:<{width}} {each.importance:8.3f} +- {each.error:.3f} {each.direction:+7.2f} sd"
             for each in self.columns[:SHOWN_PARAMETERS]
@@ -200,7 +212,9 @@ class Sensitivity(Reported):
             names = [each.name.replace("_", " ") for each in shown]
             shares, errors = ([100 * getattr(each, name) for each in shown] for name in ("importance", "error"))
             axes.barh(names, shares, xerr=errors, color="0.6", capsize=3)
-            axes.set(xlabel="importance [% of -log p]", title="What matters for a failure", xlim=(0, None))
+            label = "relative entropy of u_j given failure [% of -log p]"
+            label += "\nu_j: input j given those before it" * self.conditional
+            axes.set(xlabel=label, title="What matters for a failure", xlim=(0, None))
             axes.invert_yaxis()
         return axes
 
@@ -216,7 +230,8 @@ def compute_sensitivity(
     if len(names) != len(sizes) or sum(sizes) != dim:
         raise ValueError(f"Expected names and sizes of {dim} columns, got {len(names)} names and sizes {sizes}.")
     points = effective_number(failures.unit_totals(failures.weights))
-    found = Sensitivity(columns=_rank_columns(failures, base, names, sizes, points), points=points)
+    columns = _rank_columns(failures, base, names, sizes, points)
+    found = Sensitivity(columns=columns, points=points, conditional=_is_correlated(base, failures.x[:RECOMBINED]))
     if not by_parameters:
         return found
     labels = [
@@ -273,6 +288,15 @@ def _rank_columns(
         error = error / total if total > 0 else math.nan
         found.append(ColumnImportance(name=name, importance=value, error=error, direction=direction))
     return tuple(sorted(found, key=lambda each: -each.importance))
+
+
+def _is_correlated(base: Distribution, x: FloatArray) -> bool:
+    """Return whether a column of x depends on other columns of u: column j is exchanged by j rows in both."""
+    u = np.asarray(base.to_standard_normal(x), dtype=np.float64)
+    rows = (np.arange(len(x))[:, None] + np.arange(x.shape[1])) % len(x)
+    exchanged = np.asarray(base.from_standard_normal(np.take_along_axis(u, rows, axis=0)), dtype=np.float64)
+    moved = np.abs(exchanged - np.take_along_axis(x, rows, axis=0))
+    return not bool(np.all(moved <= ROUND_TRIP * x.std(axis=0) + 1e-9 * np.abs(x).max(axis=0)))
 
 
 def _parameter_scores(base: Any, x: FloatArray) -> FloatArray:

@@ -29,6 +29,19 @@ def test_importance_of_a_half_space_is_the_squared_direction(result):
     assert (0.64 * far**2) / 2 / -stats.norm.logsf(8.0) == pytest.approx(0.64, abs=0.06)  # the limit alpha_j^2
 
 
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0]])
+def test_importance_of_correlated_inputs_is_of_each_given_those_before(order):
+    """FORM's alpha in the space of u is L' a / |L' a| for a half-space a . x and a covariance L L'."""
+    covariance = np.array([[1.0, 0.7, 0.2], [0.7, 1.0, 0.3], [0.2, 0.3, 1.0]])[np.ix_(order, order)]
+    a = np.array([1.0, 0.8, 1.2])[order]
+    alpha = np.linalg.cholesky(covariance).T @ a
+    limit = 3.0 * np.linalg.norm(alpha)
+    problem = samplers.FunctionProblem(lambda x: limit - x @ a, base=stats.multivariate_normal(np.zeros(3), covariance))
+    found = samplers.estimate(problem, seed=0, max_sim=6000).sensitivity()
+    assert [each.name for each in found.columns] == [f"x{j + 1}" for j in np.argsort(-(alpha**2))]
+    assert found.conditional and "FORM may rank otherwise" in str(found)
+
+
 def test_irrelevant_noise_has_no_importance():
     """300 columns of noise: without the correction of the bias their block would have most of it."""
     problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], 302)
@@ -36,6 +49,7 @@ def test_irrelevant_noise_has_no_importance():
     importance = {each.name: each.importance for each in found.columns}
     assert importance["x"] > 0.6
     assert importance["noise"] < 0.05
+    assert not found.conditional and "FORM" not in str(found)
 
 
 @pytest.mark.parametrize("method", ["two-stage", "mc", "is", "ce", "adss"])
