@@ -1,0 +1,101 @@
+"""Evidence of a run: every claim can be judged again from its file, and says so when the file no longer supports it."""
+
+import json
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import jsonschema
+import pytest
+
+from rare_envs.study import Question, prepare, run_into
+from rare_envs.study.evidence import CELLS, EVIDENCE, FILES, SCHEMA, judge_leaf, write_evidence
+from rare_envs.study.run_folder import RESULT
+
+
+def make_run(folder: Path, **settings: object) -> Path:
+    asked = {"env_id": "CutIn-v0", "method": "mc", "max_sim": 4_000, "seed": 1, **settings}
+    run_into(folder, prepare(Question(**asked)))  # type: ignore[arg-type]
+    write_evidence(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with failures."""
+    return make_run(tmp_path_factory.mktemp("runs") / "cutin")
+
+
+def read(folder: Path) -> dict[str, dict[str, object]]:
+    return {name: json.loads((folder / EVIDENCE / name).read_text(encoding="utf-8")) for name in FILES}
+
+
+def test_the_files_have_the_fields_of_the_schema(run: Path) -> None:
+    content = read(run)
+    jsonschema.validate(content, SCHEMA)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**content, "claims.json": {}}, SCHEMA)
+
+
+def test_each_leaf_is_judged_again_from_its_file(run: Path) -> None:
+    nodes = read(run)["claims.json"]["nodes"]
+    leaves = [node for node in nodes if node["kind"] == "solution"]  # type: ignore[attr-defined]
+    assert len(leaves) >= 10
+    assert all(judge_leaf(run, leaf) == leaf["status"] for leaf in leaves)
+
+
+def test_a_claim_is_supported_where_all_below_it_is(run: Path) -> None:
+    nodes = {node["id"]: node for node in read(run)["claims.json"]["nodes"]}  # type: ignore[attr-defined]
+    assert nodes["G1"]["supports"] is None
+    for name, node in nodes.items():
+        below = {each["status"] for each in nodes.values() if each["supports"] == name and each["status"]}
+        if below:
+            assert (node["status"] == "supported") == (below == {"supported"})
+
+
+@pytest.mark.parametrize(
+    ("pointer", "change"),
+    [("/unseen", {"unseen": 0.9}), ("/doubtful", {"doubtful": True}), ("/interval/1", {"interval": []})],
+)
+def test_a_changed_file_changes_the_status(run: Path, tmp_path: Path, pointer: str, change: dict[str, object]) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    result = json.loads((copy / RESULT).read_text(encoding="utf-8"))
+    (copy / RESULT).write_text(json.dumps({**result, **change}), encoding="utf-8")
+    (leaf,) = (each for each in read(run)["claims.json"]["nodes"] if each.get("pointer") == pointer)  # type: ignore
+    assert judge_leaf(copy, leaf) != "supported"
+
+
+def test_test_cases_are_the_likeliest_failures_with_a_road_each(run: Path) -> None:
+    cases = read(run)["test_cases.json"]["cases"]
+    assert [case["failure"] for case in cases][:1] == [0]  # type: ignore[attr-defined]
+    for case in cases:  # type: ignore[attr-defined]
+        scenario, road = (run / EVIDENCE / name for name in case["files"])
+        assert ET.parse(scenario).getroot().tag == "OpenSCENARIO" and ET.parse(road).getroot().tag == "OpenDRIVE"
+        speeds = case["initial_conditions"]["speed_m_s"]
+        wanted = [case["parameters"][name] for name in ("ego_speed", "cut_in_speed", "lead_speed")]
+        assert speeds == pytest.approx(wanted, rel=1e-6) and case["actual_result"]["f"] == -1.0
+
+
+def test_what_is_covered_is_one_of_24_disturbances(run: Path) -> None:
+    found = read(run)["coverage.json"]["iso_34502"]
+    assert found["covered"] == ["main roadway, lane keep, cut-in"]  # type: ignore[index]
+    assert len(CELLS) == 24 and len(found["not_covered"]) == 23  # type: ignore[index]
+
+
+def test_both_simulators_agree_and_failures_replay(run: Path) -> None:
+    found = read(run)["validation.json"]
+    assert found["replays"]["differing"] == 0 < found["replays"]["compared"]  # type: ignore[index]
+    assert found["simulators"]["collisions_differing"] == 0  # type: ignore[index]
+    assert found["simulators"]["largest_difference_of_f"] < 1e-3  # type: ignore[index]
+
+
+def test_a_run_without_failures_supports_no_claim_about_them(tmp_path: Path) -> None:
+    content = read(make_run(tmp_path / "none", env_id="CarFollowing-v0", base="us101", max_sim=500))
+    jsonschema.validate(content, SCHEMA)
+    texts = {node["text"]: node["status"] for node in content["claims.json"]["nodes"]}  # type: ignore[attr-defined]
+    assert content["test_cases.json"]["cases"] == [] and texts["Failures replay"] == "not known"
+
+
+def test_the_page_says_what_it_is_not(run: Path) -> None:
+    page = (run / EVIDENCE / "evidence.html").read_text(encoding="utf-8")
+    assert "no conformity assessment" in page and "<svg" in page and "us101" in page
