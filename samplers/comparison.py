@@ -24,6 +24,7 @@ from samplers.methods import Auto
 from samplers.output import (
     Kept,
     drawing_axes,
+    format_alike,
     indent_lines,
     register_stored,
     to_json_value,
@@ -50,7 +51,7 @@ BASE_CHECK_DRAWS = 16
 class Side:
     """P[f(X) <= gamma] of one of the two problems, with its interval at the `confidence` of the comparison.
 
-    `cov` is inf where p = 0; `ess` is the effective number of independent failing units behind p.
+    `cov` is inf if p = 0; `ess` is the effective number of independent failing units behind p.
     """
 
     p: float
@@ -74,7 +75,7 @@ class Comparison(Kept):
     """
 
     ratio: float
-    """p_A / p_B; inf where p_B = 0, NaN where both are 0."""
+    """p_A / p_B; inf if p_B = 0, NaN if both are 0."""
     interval: Interval
     """Interval that should hold the true ratio with probability `confidence`."""
     confidence: float
@@ -88,7 +89,7 @@ class Comparison(Kept):
     n_sim: int
     """Simulations of A and of B together."""
     warnings: tuple[str, ...]
-    """Reasons for which the numbers are doubtful."""
+    """Reasons for which the numbers may be wrong."""
     either: Estimate = field(repr=False)
     """P[A or B fails], from which all this comes."""
     base_uncertainty: BaseUncertainty | None = None
@@ -134,26 +135,26 @@ class Comparison(Kept):
         """The ratio, or its bound where one of the two did not fail."""
         low, high = self.interval
         if self._has_ratio:
-            return f"p_A / p_B = {self.ratio:.3g}"
+            return f"p_A / p_B = {format_alike(self.ratio)[0]}"
         if math.isnan(self.ratio):
             return "p_A / p_B not known (no failure of A or B was found)"
-        bound, name = (f"below {high:.3g}", "A") if self.ratio == 0 else (f"above {low:.3g}", "B")
-        return f"p_A / p_B {bound} ({100 * self.confidence:g} % one-sided bound; no failure of {name} was found)"
+        bound, name = ("below {1}", "A") if self.ratio == 0 else ("above {0}", "B")
+        bound = bound.format(*format_alike(low, high))
+        return f"p_A / p_B {bound} ({100 * self.confidence:g} % one-sided limit; no failure of {name} was found)"
 
     def __repr__(self) -> str:
-        low, high = self.interval
-        ends = f" [{low:.3g}, {high:.3g}]" if self._has_ratio else ""
+        ends = " [{}, {}]".format(*format_alike(*self.interval)) if self._has_ratio else ""
         return f"<Comparison {self._ratio_text}{ends}, {self.n_sim:,} simulations>"
 
     def __str__(self) -> str:
         lines = [self._ratio_text]
         if self._has_ratio:
-            low, high = self.interval
-            lines.append(f"  {100 * self.confidence:g} % interval [{low:.3g}, {high:.3g}]")
+            low, high = format_alike(*self.interval)
+            lines.append(f"  {100 * self.confidence:g} % interval {low} to {high}")
         lines += indent_lines(self.base_uncertainty)
         for name, side in (("A", self.a), ("B", self.b)):
-            lines.append(f"  p_{name} = {side.p:.3e} [{side.interval[0]:.3e}, {side.interval[1]:.3e}]")
-        lines.append(f"  both fail: {self.both:.3e}; {self.n_sim:,} simulations, half of them of each")
+            lines.append("  p_{} = {} ({} to {})".format(name, *format_alike(side.p, *side.interval)))
+        lines.append(f"  both fail: {format_alike(self.both)[0]}; {self.n_sim:,} simulations, half of them of each")
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
     def to_dict(self) -> dict[str, Any]:
@@ -193,7 +194,7 @@ class EitherFails:
         return least
 
     def failing_parts(self, x: FloatArray) -> FloatArray:
-        """Return 1 where A and where B fails at points x (k, d) that were simulated, 0 elsewhere, shape (2, k)."""
+        """Return 1 if A and if B fails at points x (k, d) that were simulated, 0 elsewhere, shape (2, k)."""
         unknown = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
         if unknown.any():  # mapped there and back in another batch, some coordinate differs by its last bit
             self.evaluate(x[unknown])
@@ -221,7 +222,7 @@ def compare(
     quantile of the effective number of draws where only one of them fails; without such draws it follows from the
     Clopper-Pearson bound on their probability.
 
-    Where the base distribution has refits (`FittedBase`), both probabilities are also known under each refit, and so
+    If the base distribution has refits (`FittedBase`), both probabilities are also known under each refit, and so
     is the uncertainty of the ratio that the events leave (`Comparison.base_uncertainty`): as a rule several times
     smaller than that of either probability.
 
@@ -294,12 +295,12 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
         for name, s in (("A", a), ("B", b))
         if s.ess < MIN_SIDE_ESS
     ]
-    about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
+    about = [f"{' and '.join(few)}: the ratio is imprecise; estimate each separately."] if few else []
     for name, own, s in (("A", totals[0], a), ("B", totals[1], b)):
         most, where = _find_missed(own, totals, either)
         if most > UNRESOLVED_SHARE * s.p > 0:
             about.append(
-                f"{name} may fail more often by up to {most:.1e} in {' and '.join(where)}, where it hardly did."
+                f"{name} may fail more often by up to {most:.1e} in {' and '.join(where)}: too few failures found."
             )
     interval = _ratio_interval(totals, factor, single, either)
     n_sim = problem.n_sim - (0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim)
@@ -329,7 +330,7 @@ def _base_uncertainty(
         return None
     p_a, p_b = (float(p) for p in totals.sum(axis=1))
     if p_a == 0 or p_b == 0:
-        why = "one of the two never failed."
+        why = "A or B never failed."
         return summarise_refits(_ratio(p_a, p_b), math.inf, either.confidence, fitted, NO_SUMS, reason=why)
     sums = reweight_runs_to_refits(either, fitted.refits, lambda run: problem.failing_parts(require_sample(run).x))
     cov = factor * _error(totals[0] / p_a - totals[1] / p_b)
@@ -340,7 +341,7 @@ def _base_uncertainty(
 
 
 def _ratio(a: float, b: float) -> float:
-    """Return a / b; inf where b alone is 0, NaN where both are."""
+    """Return a / b; inf if b alone is 0, NaN if both are."""
     if b > 0:
         return a / b
     return math.inf if a > 0 else math.nan

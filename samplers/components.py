@@ -1,6 +1,6 @@
 """Components of proposal mixtures in standard normal space, and the fit of mixtures by expectation-maximisation.
 
-Each has its density ratio to N(0, I). Where a component is N(0, I) in most directions, its ratio depends on the few
+Each has its density ratio to N(0, I). If a component is N(0, I) in most directions, its ratio depends on the few
 others only, which keeps weights exact and cheap in hundreds of dimensions.
 
 References:
@@ -35,7 +35,7 @@ class MixtureComponent(Protocol):
     """A distribution in standard normal space with a known density ratio to N(0, I)."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
-        """Return log(q / phi) at u (n, d), shape (n,); -inf where the density q is 0."""
+        """Return log(q / phi) at u (n, d), shape (n,); -inf if the density q is 0."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -287,7 +287,7 @@ def log_normaliser(kappa: float, dim: int) -> float:
 
 
 LEAST_VARIANCE = 1e-8
-"""Stands for 0 where a logarithm is taken: points may coincide."""
+"""Stands for 0 if a logarithm is taken: points may coincide."""
 
 
 def shrink_covariance(

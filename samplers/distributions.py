@@ -85,7 +85,7 @@ def project_mean(target: FloatArray, centre: FloatArray, cholesky: FloatArray, r
 PAPERS_BOX = (1.5, 7.0)
 """Range of alpha and beta in O'Kelly et al. 2018; their released code has [0.5, 5]."""
 SMALLEST = float(np.finfo(np.float64).tiny)
-"""Stands for 0 where the logarithm is taken."""
+"""Stands for 0 if the logarithm is taken."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,8 +97,8 @@ class BetaBlock:
     Args:
         alpha: First parameter, positive; a number or shape (b,), as all four.
         beta: Second parameter.
-        low: Lower end of the support.
-        high: Upper end.
+        low: Lower bound of the support.
+        high: Upper bound.
         box: Bounds of both parameters throughout the family.
 
     Raises:
@@ -414,7 +414,7 @@ def announced_blocks(inputs: Inputs) -> Product:
     trial = product.sample(4, np.random.default_rng(0))
     if product.dim != inputs.dim or not np.allclose(product.log_prob(trial), inputs.base.log_prob(trial)):
         raise ValueError(
-            f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its distribution: mend `blocks`, or "
+            f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its distribution: correct `blocks`, or "
             'take family="gaussian", which works with any.'
         )
     return product

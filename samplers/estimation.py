@@ -82,8 +82,8 @@ def estimate(
 ) -> Estimate:
     """Estimate P[f(X) <= gamma], X ~ problem.base.
 
-    Where the base distribution was fitted and has refits (`FittedBase`), the failing points also give p under each
-    refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). Where they do not reach more
+    If the base distribution was fitted and has refits (`FittedBase`), the failing points also give p under each
+    refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). If they do not reach more
     than a tenth of the refits (under 10 effective points), one further run is made under the mixture of the refits,
     `base.covering_ensemble()` or `base.ensemble()`, with the same method (`TwoStage`, if that one cannot search under a
     mixture), seed and rule for errors. p and its interval remain those of the first run.
@@ -103,14 +103,14 @@ def estimate(
         replicates: Independent runs, side by side: f gets the points of all of them in one batch, and each has an equal
             share of max_sim. Counts of MonteCarlo are pooled (Clopper-Pearson); others are combined by their mean with
             a t interval on the log scale, which is very wide with 2 or 3 runs.
-        on_error: Where f raises or returns NaN, twice: "raise" stops and names the row; "failure" counts the point as
-            failing; "bound" counts it as failing in p and in the upper end of the interval, but not in the lower end.
-            Of a batch that raises at most 1.2 times the rows are simulated again, beside max_sim.
+        on_error: If f raises or returns NaN, twice: "raise" stops and names the row; "failure" counts the point as
+            failing; "bound" counts it as failing in p and in the upper limit of the interval, but not in the lower
+            one. If a batch raises, at most 1.2 times its rows are simulated again, beside max_sim.
         progress: True for a bar on standard error, or a function that gets `Progress`.
         time_limit: Seconds after which the run is stopped, checked after every batch.
         stop: Function that gets `Progress` after every batch; the run is stopped when it returns True.
         ensemble_run: Whether the further run may be made. Its simulations are in `base_uncertainty.n_sim`; max_sim
-            limits them anew, time_limit and stop hold for both runs. None is made after a run that was stopped.
+            limits them again, time_limit and stop apply to both runs. None is made after a run that was stopped.
         journal: File that keeps finished simulations. The same call continues a run that was interrupted or killed, and
             comes to the result of an undisturbed run; of one that is done it takes no simulations. A power cut loses
             one second and the batch. A file that is damaged, in use, or of other points or another f is refused.
@@ -124,8 +124,8 @@ def estimate(
             + 1) bytes each; otherwise it holds the weights of the draws behind p, and x of the failing ones.
 
     Returns:
-        The probability, its interval, its cost and the failures. Of a run that was stopped (status
-        "stopped"), the estimate from the simulations made so far.
+        The probability, its interval, its cost and the failures. With the status "stopped", they
+        are of the simulations made so far.
 
     Raises:
         ValueError: If an argument is not as described, f does not return one number per row, or the journal cannot be
@@ -251,7 +251,7 @@ def add_ensemble_run(
 ) -> Estimate:
     """Return an estimate with the run under the mixture of the refits, where it needs one and there can be one.
 
-    `TwoStage` makes that, by `run(inputs, method, arguments)`, where the method cannot search under a mixture.
+    `TwoStage` makes that, by `run(inputs, method, arguments)`, if the method cannot search under a mixture.
     """
     base, split = evaluator.base, getattr(evaluator.problem, "failing_parts", None)  # shares (m, k) of points in parts
     if first.status is Status.STOPPED or not needs_ensemble_run(first, split) or not hasattr(base, "ensemble"):
@@ -279,9 +279,9 @@ def _add_remarks(result: Estimate, evaluator: Evaluator) -> Estimate:
     if evaluator.n_retried:
         remarks.append(f"{evaluator.n_retried} rows were simulated again to find those on which f raises.")
     if evaluator.faults and not evaluator.lost:
-        remarks.append(f"Of the first simulation without an outcome: {evaluator.faults[0].reason}.")
+        remarks.append(f"The first simulation without an outcome: {evaluator.faults[0].reason}.")
     if evaluator.lost:
-        remarks.append(f"No worker survived {len(evaluator.lost)} rows; of the first: {evaluator.lost[0]}.")
+        remarks.append(f"No worker survived {len(evaluator.lost)} rows; the first of them: {evaluator.lost[0]}.")
     return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result
 
 

@@ -2,7 +2,7 @@
 
     request -> chunks -> journal, or work (here or by a worker) -> journal -> answer
 
-What comes back is checked. Where the problem raises or gives NaN, the rows that fail are found, and each simulation is
+What comes back is checked. If the problem raises or gives NaN, the rows that fail are found, and each simulation is
 counted. `samplers.executors` has the workers.
 """
 
@@ -38,7 +38,7 @@ from samplers.problem import (
 )
 
 CHUNK_SIZE = 16
-"""Rows of a chunk of workers where the problem has no `chunk_size`."""
+"""Rows of a chunk of workers if the problem has no `chunk_size`."""
 N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first chunk to the largest."""
 F_TOLERANCE = 1e-3
@@ -55,8 +55,8 @@ class Result(NamedTuple):
     """What a chunk gives."""
 
     table: FloatArray
-    """A row for each row of the chunk, (n, k): f; f, values and ticks of terms; or a gradient. NaN where there is none;
-    k = 1 where no row has any."""
+    """A row for each row of the chunk, (n, k): f; f, values and ticks of terms; or a gradient. NaN if there is none;
+    k = 1 if no row has any."""
     notes: dict[str, Any]
     """What else is known, JSON-ready: `reasons` of rows without f, in their order (in an attempt: by row), `n_retried`,
     `lost`, `seconds`, `cost` of gradients, `threshold` and `names` of terms."""
@@ -85,12 +85,12 @@ def join_results(parts: Sequence[Result]) -> Result:
 def isolate(attempt: Callable[[Request], Result], chunk: Request, fail: Callable[..., None]) -> Result:
     """Return what the rows of a chunk give, those that fail left out; notes have their `reasons` as a dict by row.
 
-    Where the attempt at all rows raises, they are attempted in parts until the rows that raise stand alone. The parts
+    If the attempt at all rows raises, they are attempted in parts until the rows that raise stand alone. The parts
     are as large as lets no more than a tenth of the chunk and of the rows done be in parts that raise: it all takes 1.2
     attempts a row at most, and the fewer calls the fewer rows raise. A row that has given nothing is attempted once
     more; if that gives nothing either, `fail(row, reason, error)` is told, which may raise.
 
-    Where an error means that an answer was waited for (its attribute `waits`), attempts are cheaper than errors: then
+    If an error means that an answer was waited for (its attribute `waits`), attempts are cheaper than errors: then
     parts of the root of the chunk, and each row alone of a part that raises.
     """
     n_retried, lost, unsure = 0, dict[int, str](), dict[int, str]()
@@ -267,7 +267,7 @@ class Pool:
     """What computes chunks: this process, one after the other; `samplers.executors` has pools of others.
 
     Attributes:
-        workers: Their number; 0 where there is no executor.
+        workers: Their number; 0 if there is no executor.
         n_retries: Chunks and rows that were computed again because a worker was lost.
     """
 
@@ -309,7 +309,7 @@ class Simulated(NamedTuple):
     x: FloatArray
     """Shape (n, d)."""
     f: FloatArray
-    """Shape (n,); NaN where there is no outcome."""
+    """Shape (n,); NaN if there is no outcome."""
     reasons: list[str]
     """Why there is none, in their order."""
     seconds: FloatArray
@@ -399,7 +399,7 @@ class Evaluator:
         return [answers[i] for i in range(len(requests))]
 
     def evaluate(self, x: FloatArray) -> FloatArray:
-        """Return f of points x (n, d), shape (n,); NaN where there is no outcome."""
+        """Return f of points x (n, d), shape (n,); NaN if there is no outcome."""
         return self._compute(Request("f", (x,))).table[:, 0]
 
     def _read_terms(self, table: FloatArray, notes: dict[str, Any]) -> Terms:
@@ -408,7 +408,7 @@ class Evaluator:
         return Terms(f[:, 0], values, np.nan_to_num(ticks).astype(np.int64), threshold, tuple(names))
 
     def _compute(self, request: Request) -> Result:
-        """Return the result of a request, as far as it goes from the journal; NaN where rows have none."""
+        """Return the result of a request, as far as it goes from the journal; NaN if rows have none."""
         request = Request(request.kind, (np.asarray(request.x, dtype=np.float64), *request.arrays[1:]))
         chunks, results = self._restore(request)
         first, self._n_chunks = self._n_chunks, self._n_chunks + len(request.split(self._size))
@@ -446,7 +446,7 @@ class Evaluator:
             raise JournalError(
                 f"After {self.n_restored:,} simulations this run asks for other points than "
                 f"{str(self._journal.path)!r} has: arguments, base distribution or libraries have changed since it was "
-                "begun. Remove the file to begin anew."
+                "started. Remove the file to start again."
             )
         for number, result in known.items():
             self.n_restored += len(chunks[number])
@@ -505,7 +505,7 @@ class Evaluator:
             row = int(np.argmax(changed))
             raise JournalError(
                 f"f is {again.table[row, 0]:.6g} at a point where {str(journal.path)!r} has {f[row]:.6g}: it has "
-                "changed since the journal was begun. Remove the file to begin anew."
+                "changed since the journal was started. Remove the file to start again."
             )
 
 

@@ -205,7 +205,7 @@ class RayCluster(_Processes):
 
     @contextmanager
     def open(self, work: Work) -> Iterator[WorkerPool]:
-        """Yield the cluster; one that was started here ends with the block. An ExecutorError where there is none."""
+        """Yield the cluster; one that was started here ends with the block. An ExecutorError if there is none."""
         try:
             import ray
         except ImportError as error:
@@ -287,7 +287,7 @@ class _Task:
 class WorkerPool(Pool):
     """Objects with `submit`, in slots, and the work to be done; those of ours are replaced where broken.
 
-    Where it `blames`, a worker that is lost costs its own chunk alone, and each worker has one chunk in flight, else
+    If it `blames`, a worker that is lost costs its own chunk alone, and each worker has one chunk in flight, else
     two: all in flight are then lost together, and suspects go alone.
     """
 

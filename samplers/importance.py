@@ -51,7 +51,7 @@ LEAST_FACTOR = 0.1
 
 
 class Calibration(NamedTuple):
-    """Calibrated weights of n draws, as factors c (n,) of their own; m = 0 where the weights stay as they are."""
+    """Calibrated weights of n draws, as factors c (n,) of their own; m = 0 if the weights stay as they are."""
 
     factors: FloatArray
     controls: FloatArray  # H (n, m)
@@ -99,7 +99,7 @@ one, and 45 of 93 that were off by more than 4 errors (67 limit states); from 10
 class Draws:
     """n independent draws from one proposal, of which k fail; `log_weights` are log(p0 / q), calibrated or not.
 
-    `fails` says which draws fail, in the order in which they were simulated, (n,); empty where that is not known.
+    `fails` says which draws fail, in the order in which they were simulated, (n,); empty if that is not known.
     """
 
     n: int
@@ -160,7 +160,7 @@ class Draws:
 
     @property
     def skewness(self) -> float:
-        """Skewness of a term, weight times indicator of failure; 0 where all are equal."""
+        """Skewness of a term, weight times indicator of failure; 0 if all are equal."""
         if len(self.f) == 0:
             return 0.0
         w = np.exp(self.log_weights - self.log_weights.max())
@@ -208,7 +208,7 @@ def weighted_interval(
 ) -> Interval:
     """Return the interval of p: log-normal, with t quantiles for few draws; Clopper-Pearson's for plain ones.
 
-    Below LOW_ESS its upper end is at least `bernstein_bound`, or `ceiling` where that is less, and its lower end
+    Below LOW_ESS its upper limit is at least `bernstein_bound`, or `ceiling` where that is less, and its lower limit
     that without the heaviest draw, where it lies above p without this. Without a failing draw
     p <= largest_weight P_q[failure].
     """
@@ -229,7 +229,7 @@ def weighted_interval(
 
 
 def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> float:
-    """Return the upper end of p by Maurer and Pontil, theorem 4, at the level (1 - confidence) / 2."""
+    """Return the upper limit of p by Maurer and Pontil, theorem 4, at the level (1 - confidence) / 2."""
     log_term = math.log(4 / (1 - confidence))
     weights, less = np.exp(draws.log_weights), max(draws.n - 1, 1)
     variance = max(float((weights**2).sum()) - draws.n * draws.p**2, 0.0) / less
@@ -238,12 +238,12 @@ def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> f
 
 
 def weight_warnings(draws: Draws) -> list[str]:
-    """Return a warning where no draw failed, or where those that failed are worth few independent ones."""
+    """Return a warning if no draw failed, or if those that failed are worth few independent ones."""
     if len(draws.f) == 0:
         return [f"None of {draws.n:,} final draws failed: p = 0 with a one-sided interval."]
     if draws.ess >= COARSE_ESS:
         return []
-    return [f"Effective sample size of the failing draws: {draws.ess:.0f}; {COARSE}."]
+    return [f"The failing draws have an effective sample size of {draws.ess:.0f}; {COARSE}."]
 
 
 def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
@@ -260,7 +260,7 @@ def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
 
 
 MOST_FINAL_BATCHES = 100
-"""Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
+"""Batches of final draws after which a target c.o.v. is given up if max_sim does not say."""
 
 
 def count_final_draws(goal: Goal, spent: int, n_final: int) -> int:
@@ -297,7 +297,7 @@ class Search:
 
     It works in the space of the base distribution `base` there, N(0, I) as a rule, which `to_x` maps to physical space.
     `rounds` are those whose draws are kept, the first from the base; `trace` has a record of every round. The status is
-    CONVERGED where the search reached gamma.
+    CONVERGED if the search reached gamma.
     """
 
     def __init__(
@@ -322,7 +322,7 @@ class Search:
     def draw(
         self, proposal: ProposalDistribution, n_round: int, max_rounds: int
     ) -> Generator[FloatArray, FloatArray, Round | None]:
-        """Simulate n_round draws, fewer where max_sim is small; None where the search is over, its status says why."""
+        """Simulate n_round draws, fewer if max_sim is small; None if the search is over, its status says why."""
         budget = self.goal.budget
         size = min(n_round, budget // LEAST_ROUNDS)
         if len(self.trace) == max_rounds:

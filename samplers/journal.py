@@ -266,7 +266,7 @@ def _connect(path: Path) -> sqlite3.Connection:
         connection.close()
         if "malformed" in str(error):
             raise _Damaged(path) from error
-        raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.") from error
+        raise JournalError(f"{str(path)!r} is of another kind or version: remove it to start again.") from error
     return connection
 
 
@@ -298,7 +298,7 @@ def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
         raise NothingRecorded(f"{str(path)!r} was cut before its first record; nothing is recorded in it.")
     # a view in the table's place may have rows without end, and triggers change what is written
     if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT or schema != [TABLE]:
-        raise JournalError(f"{str(path)!r} is of another kind or version: remove it to begin anew.")
+        raise JournalError(f"{str(path)!r} is of another kind or version: remove it to start again.")
     notes, head = [row.notes for row in _good_rows(path, connection) if row.id == HEAD], None
     with contextlib.suppress(ValueError, RecursionError):
         head = json.loads(notes[0])

@@ -38,7 +38,7 @@ from samplers.sample import (
 class Kernel:
     """Proposal of the moves of a level's chains, with its adaptation (Tian et al. 2024); it leaves N(0, I) invariant.
 
-    sigma = scale sigma_0, with deviations sigma_0 (d,), and at most 1 where the scale adapts (equation 14).
+    sigma = scale sigma_0, with deviations sigma_0 (d,), and at most 1 if the scale adapts (equation 14).
     Conditional sampling, v = rho u + sigma xi with xi ~ N(0, I) and rho = sqrt(1 - sigma^2), does so on its own.
     Metropolis moves every component by a symmetric step, normal or uniform with half-width sigma, kept with probability
     min(1, phi(new) / phi(old)) (equations 19, 20): a step that is not symmetric needs another ratio.

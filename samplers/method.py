@@ -75,12 +75,12 @@ class Outcome:
     interval: tuple[float, float]
     """Interval that should hold the true p with probability `confidence`."""
     cov: float
-    """Estimated coefficient of variation of p; inf where p = 0."""
+    """Estimated coefficient of variation of p; inf if p = 0."""
     status: Status
     """End of the run."""
     sequence: Interval | None = None
-    """Ends of p that hold at all looks together (an asymptotic confidence sequence), where the run stopped on what it
-    saw, as by `target_cov`; None where it did not, or nothing failed."""
+    """Ends of p that hold at all looks together (an asymptotic confidence sequence), if the run stopped on what it
+    saw, as by `target_cov`; None if it did not, or nothing failed."""
     warnings: tuple[str, ...] = ()
     """Reasons for which the numbers are doubtful, a sentence each; empty if none is known."""
     remarks: tuple[str, ...] = ()
@@ -99,11 +99,11 @@ class Outcome:
     counts: tuple[int, int] | None = None
     """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
     draw_weights: tuple[DrawWeights, ...] = field(default=(), compare=False, repr=False)
-    """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
+    """Weights of single simulations in p; empty if p is no sum over simulations, as with chains."""
     parts: "tuple[Part, ...]" = ()
-    """The strata of the base distribution, whose p_k with their shares w_k add up to p; empty where it has none."""
+    """The strata of the base distribution, whose p_k with their shares w_k add up to p; empty if it has none."""
     chosen: "Choice | None" = field(default=None, compare=False, repr=False)
-    """Method that the method of the run chose for it, as `Auto` does; None where it chose none."""
+    """Method that the method of the run chose for it, as `Auto` does; None if it chose none."""
 
     def bound_missed(self, confidence: float) -> float:
         """Return the largest probability of a region that all base draws miss with probability 1 - confidence."""
@@ -158,11 +158,11 @@ class Part:
     n_sim: int = 0
     """Simulations in this stratum, pilot included."""
     of_sum: float = math.nan
-    """w_k p_k / p; NaN where p = 0."""
+    """w_k p_k / p; NaN if p = 0."""
     method: str = ""
     """Names of the methods of its runs in their order: "mc, two-stage" for a search after a pilot of plain draws."""
     resolved: bool = True
-    """Whether failures were met often enough to say how likely they are; if not, the upper end alone is to be used."""
+    """Whether enough failures were found to say how likely they are; if not, only the upper limit is to be used."""
     n_units: int = field(default=0, compare=False, repr=False)
     """Independent units of its points; in `Estimate.sample` they follow those of the parts before."""
 
@@ -189,7 +189,7 @@ class Part:
             what = f"no failure in {self.n_sim:,} simulations" if self.n_sim else "not simulated"
             return f"{about}p below {high:.1e}, {what}"
         if not self.resolved:
-            return f"{about}p below {high:.1e}, not resolved ({self.p:.1e} found) by {self.n_sim:,} simulations"
+            return f"{about}p below {high:.1e}, too few failures found (p = {self.p:.1e}) in {self.n_sim:,} simulations"
         ends = f"[{low:.3e}, {high:.3e}]"
         return f"{about}p = {self.p:.3e} {ends}, {100 * self.of_sum:.3g} % of the sum; {self.n_sim:,} simulations"
 
@@ -226,7 +226,7 @@ class Interrupted(Exception):
 Steps = Generator[FloatArray, FloatArray, Outcome]
 """Generator that yields points x (n, d) to be simulated, is sent their f (n,) and returns the outcome.
 
-Where its inputs offer them (`offer_of`), it may also ask for terms and gradients, by `request_terms` and
+If its inputs offer them (`offer_of`), it may also ask for terms and gradients, by `request_terms` and
 `request_gradients` alone."""
 
 
@@ -248,7 +248,7 @@ class TermsOffer:
 
 
 def offer_of(inputs: Inputs) -> TermsOffer | None:
-    """Return what a run answers beside f; None where it has only f, as with simulations that the user makes."""
+    """Return what a run answers beside f; None if it has only f, as with simulations that the user makes."""
     offer: TermsOffer | None = getattr(inputs, "offer", None)  # of the inputs of a run
     return offer
 
@@ -283,7 +283,7 @@ class Request:
 
 
 Answer = FloatArray | Terms | TermGradients
-"""What steps are sent: f, terms (with f = -inf, and every term, where there is no outcome), or gradients."""
+"""What steps are sent: f, terms (with f = -inf, and every term, if there is no outcome), or gradients."""
 
 
 def request_terms(x: FloatArray) -> Generator[FloatArray, FloatArray, Terms]:
@@ -363,7 +363,7 @@ class EstimateData(Outcome):
     n_sim: int
     """Simulated points of the whole run, search included."""
     gain: float
-    """Plain Monte Carlo runs for the same c.o.v., divided by n_sim; NaN where p is 0 or 1."""
+    """Plain Monte Carlo runs for the same c.o.v., divided by n_sim; NaN if p is 0 or 1."""
     failures: Failures
     """Failing points, the most likely first."""
     method: Stepping
@@ -377,9 +377,9 @@ class EstimateData(Outcome):
     given: str = ""
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
     column_names: tuple[str, ...] = field(default=(), compare=False, repr=False)
-    """Names of the columns of x, the problem's attribute `column_names`; empty where it has none."""
+    """Names of the columns of x, the problem's attribute `column_names`; empty if it has none."""
     closest: Closest | None = field(default=None, compare=False, repr=False)
-    """The simulation with the least f of all, search included; None where none had an outcome."""
+    """The simulation with the least f of all, search included; None if none had an outcome."""
     ensemble_run: "EstimateData | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
     spans: tuple[tuple[int, int, int], ...] = field(default=(), compare=False, repr=False)
@@ -392,7 +392,7 @@ class EstimateData(Outcome):
 
     @property
     def choice(self) -> str:
-        """Method that `Auto` chose and why, on one line; empty where the method was named."""
+        """Method that `Auto` chose and why, on one line; empty if the method was named."""
         return "" if self.chosen is None else self.chosen.why
 
     def describe_simulations(self, first: int, n: int) -> SimulationRows:

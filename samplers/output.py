@@ -240,37 +240,39 @@ FACTS: Mapping[str, str] = MappingProxyType(
     {
         "p": "{p}{odds}; {sure} interval {low} to {high}",
         "p without a lower limit": "{p}{odds}; below {high} ({sure}), no lower limit",
+        "p without limits": "{p}{odds}; neither a lower nor an upper limit ({sure})",
         "nothing failed": "none in {n} simulations; below {high} ({sure})",
-        "failures of the search alone": "none that counts in p, {found} in the search; below {high} ({sure})",
-        "limited by simulations": "{n} simulations{few}; more of them (max_sim) help",
-        "limited by events": "{events}, not simulations{exact}; more recordings help",
-        "limited by both": "{events} ({share}) and {n} simulations ({rest}){few}{exact}",
-        "too few in strata": ", too few in {strata}",
+        "failures of the search alone": "none counts in p, {found} found in the search; below {high} ({sure})",
+        "limited by simulations": "{n} simulations; more of them (max_sim) help{few}",
+        "limited by events": "{events}; more recordings help, more simulations do not{exact}",
+        "limited by both": "{events} ({share}) and {n} simulations ({rest}); more of both help{few}{exact}",
+        "too few failures": "; stratum {name}: too few failures found, below {high}",
+        "too few events": "too few recorded events for {what}",
         "if the model is exact": "; {low} to {high} if the {model} is exact",
-        "error not known": "error of the {model}: {reason}",
-        "may miss": "failures of a kind rarer than {unseen} ({sure}) that no simulation came near",
-        "may miss anything": "failures of a kind that no simulation came near, however likely",
+        "error not known": "error of the {model} ({reason})",
+        "may miss": "failure modes rarer than {unseen} ({sure}) that the search did not find",
+        "may miss anything": "failure modes of any probability that the search did not find",
         "warnings": "{first} ({more} more)",
         "next": "{command} ({what})",
-        "details": "method, c.o.v., all intervals, remarks",
+        "details": "method, relative error, all intervals, remarks",
         "report": "crash clips, parameters, all intervals",
         "rate": "{rate}; people in {noun} {people}",
         "rate of all": "{rate}; people in the same events {people}",
         "rate of one": "{noun} {rate}; people {people}; human driver model {model}",
-        "serious injuries": "{rate}, serious ones (MAIS 3+)",
-        "calibrated": "human driver model {model}, within a factor {factor} of people's interval",
+        "serious injuries": "{rate}, serious (MAIS 3+)",
+        "calibrated": "human driver model {model}, within a factor of {factor} of people's interval",
         "not calibrated": "not calibrated: human driver model {model}, {far}",
         "not measured": "not calibrated: human driver model not measured in {traffic}",
-        "crash": "{who} runs into {whom}, {speed} m/s at contact, delta-v {delta_v} m/s",
+        "crash": "{contact}, {speed} m/s at contact, delta-v {delta_v} m/s",
         "avoids": "{driver} avoids {share} of these",
         "likeliest": "{kinds}; most likely: {what}",
-        "usual": "every parameter usual",
+        "usual": "all parameters in their usual range",
         "unusual": "{name} {value} {unit} (usually {low} to {high})",
         "passes": "{what} below {limit} ({sure} confidence, upper limit {high})",
         "fails": "{what} above {limit} ({sure} confidence, lower limit {low})",
         "undecided": "{what} {low} to {high} ({sure} confidence), limit {limit}",
-        "too few simulations": "more simulations are needed",
-        "too few events": "more recordings are needed, not simulations",
+        "more simulations": "more simulations are needed",
+        "more events": "more recordings are needed, not simulations",
         "if exact": "it {decision} if the base distribution is exact",
         "gate": "GATE {decision} (exit code {code}): {why}",
     }
@@ -278,8 +280,9 @@ FACTS: Mapping[str, str] = MappingProxyType(
 """The wording of each fact of an answer, on the terminal, in notebooks, in reports and as `text` in JSON."""
 WIDTH, LABEL, MOST_LINES = 98, 13, 12
 """Columns of an answer, those of the names of its facts, and lines."""
-LARGE, SMALL, SMALL_BESIDE = 99.5, 0.01, 0.001
-"""Numbers from which whole ones are shown, and below which powers of ten: alone, and beside one above `SMALL`."""
+LARGE, SMALL, PLAIN = 99.5, 1e-4, 0.1
+"""Numbers from which on whole ones are shown; below which powers of ten, in others of the group too unless one of them
+reaches the last."""
 Row = tuple[str, str]
 """A fact of an answer: its name, and its text."""
 
@@ -322,15 +325,14 @@ def unfold_rows(lines: Sequence[str]) -> list[Row]:
 
 
 def format_alike(*values: float) -> list[str]:
-    """Return numbers with two digits, all as decimals or all with powers of ten."""
+    """Return numbers with two digits, as decimals; small ones, and what stands with them, with powers of ten."""
     sizes = [value for value in values if value > 0 and math.isfinite(value)]
-    least = SMALL if max(sizes, default=SMALL) < SMALL else SMALL_BESIDE
-    decimal = all(value >= least for value in sizes)
+    decimal = min(sizes, default=1.0) >= SMALL or max(sizes) >= PLAIN
 
     def write(value: float) -> str:
         if value <= 0 or not math.isfinite(value):
             return f"{value:g}"
-        if not decimal:
+        if value < SMALL or not decimal:
             return f"{value:.1e}"
         if value >= LARGE:
             return f"{round(value, 1 - math.floor(math.log10(value))):,.0f}"

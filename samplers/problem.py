@@ -68,7 +68,7 @@ def check_settings(method: object, **rules: int | tuple[float, float] | tuple[st
 
 
 OnError = Literal["raise", "failure", "bound"]
-"""Rows on which f raises or gives NaN: stop, count the row as failing, or count it so in p and the upper end only."""
+"""Rows on which f raises or gives NaN: stop, count the row as failing, or count it so in p and the upper limit only."""
 ON_ERROR: tuple[str, ...] = get_args(OnError)
 
 
@@ -226,11 +226,11 @@ class Inputs(Protocol):
 class Problem(Inputs, Protocol):
     """P[f(X) <= gamma] for X ~ base; small f is dangerous.
 
-    Any object with these three attributes is one; nothing has to be inherited. Where f is the least of several terms, a
+    Any object with these three attributes is one; nothing has to be inherited. If f is the least of several terms, a
     problem may tell them apart, and methods may ask for terms in place of f, at the price of one simulation a row; an
     attribute that is None counts as not offered:
 
-    - `terms(x, gamma)` gives the `Terms` of x (n, d). Where that is another simulation than f, a slower one that rounds
+    - `terms(x, gamma)` gives the `Terms` of x (n, d). If that is another simulation than f, a slower one that rounds
       otherwise, an attribute `terms_with_f` that is False says so.
     - `gradient(x, term, ticks, gamma)` gives the `TermGradients` with respect to x of one term of each point, whose
       number and ticks (n,) `terms` told; a row takes at most `gradient_cost` simulations, above 0.
@@ -259,7 +259,7 @@ class Terms:
 
     A term is a part of a series system: another car that may be hit, a pair of them, a beam of the lidar. For one
     threshold gamma the failures are those of the terms, {f <= gamma} = {min_j values[:, j] <= threshold}. The terms
-    need not be f's own. Where failure is a collision, `values` may be clearances with threshold 0: they tell near from
+    need not be f's own. If failure is a collision, `values` may be clearances with threshold 0: they tell near from
     far where f does not.
 
     Example:
@@ -274,11 +274,11 @@ class Terms:
     values: FloatArray
     """Terms, in the order in which to search: small is dangerous; shape (n, J)."""
     ticks: NDArray[np.int64]
-    """Index of the time at which each term is attained, 0 where time means nothing; shape (n, J)."""
+    """Index of the time at which each term is attained, 0 if time means nothing; shape (n, J)."""
     threshold: float
     """Terms fail at or below it."""
     names: tuple[str, ...] = ()
-    """Names of the J terms for messages; numbers where there are none."""
+    """Names of the J terms for messages; numbers if there are none."""
 
     @property
     def least(self) -> NDArray[np.int64]:
@@ -317,7 +317,7 @@ def check_shares(names: Sequence[Any], shares: Sequence[Any]) -> None:
 
 
 def read_strata(base: Any) -> tuple[Any, ...]:
-    """Return the strata of a base distribution (see `Distribution`), none where it has fewer than two.
+    """Return the strata of a base distribution (see `Distribution`), none if it has fewer than two.
 
     Raises:
         ValueError: If names, shares or bases do not fit.
@@ -389,13 +389,13 @@ class FunctionProblem:
     Args:
         f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. Leave it out if there are `terms`,
             or if simulations are made elsewhere: `start` of a method then needs `dim` or `base` only.
-        dim: Number of dimensions d; may be left out where the base has one.
+        dim: Number of dimensions d; may be left out if the base has one.
         terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system; None for
             none. The problem's own `terms` gives `Terms`.
         gradient: Maps points of shape (n, d) and the numbers of their terms, shape (n,), to the gradients of these
             terms, shape (n, d); None for none. The problem's own `gradient` gives `TermGradients`.
         gradient_cost: Simulations that a row of `gradient` counts as.
-        vectorized: False where f maps one point of shape (d,) to a number, as a program does that simulates one drive.
+        vectorized: False if f maps one point of shape (d,) to a number, as a program does that simulates one drive.
         chunk_size: Rows that workers get at once; None for 16, and for 1 of an f of one point.
         base: Distribution of X: N(0, I) by default, a `Distribution`, or what `as_distribution` takes: a frozen
             distribution of SciPy (of one coordinate: all `dim` have it), one of OpenTURNS, or a list of them.

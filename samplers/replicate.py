@@ -49,7 +49,7 @@ NOT_KNOWN = Outcome(
     interval=(0.0, 1.0),
     cov=math.inf,
     status=Status.STOPPED,
-    warnings=("The run was stopped before its method could say anything: p = 0 stands for not known.",),
+    warnings=("The run was stopped before its method had an estimate: p = 0 means not known.",),
 )
 """Outcome of a run that was stopped before its first values of f, or whose method does not handle `Interrupted`."""
 
@@ -64,7 +64,7 @@ class InputsOnly:
 
 
 def meets_target(outcomes: Sequence[Outcome], target_cov: float | None, replicates: int) -> bool:
-    """Return whether these runs together meet target_cov (as they do where there is none).
+    """Return whether these runs together meet target_cov (as they do if there is none).
 
     With more of them than `replicates`, at least MIN_REPLICATES are made unless their counts pool.
     """
@@ -205,7 +205,7 @@ STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERG
 def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     """Return R independent runs as one: pooled counts, or their mean with a t interval.
 
-    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer run, with the
+    If every run is a share k_i / n_i of independent draws, the draws are those of one longer run, with the
     Clopper-Pearson interval: a t interval would ignore that the spread of counts is known. Otherwise p is the mean of
     p-hat (unbiased; its logarithm is not). Runs that were stopped before their end are left out of the mean if any run
     came to its end: one that has not reached the failures has p-hat = 0. Their levels stay in the trace. Of sums over
@@ -324,7 +324,7 @@ def _warn_of_disagreement(outcomes: Sequence[Outcome], p: FloatArray) -> list[st
         apart = float((((p - p.mean()) / error) ** 2).sum())
     if chdtrc(len(p) - 1, apart) > DISAGREEMENT_LEVEL:
         return []
-    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
+    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a failure region."]
 
 
 def _merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
@@ -375,14 +375,14 @@ def _collect_texts(of_runs: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
 UNRESOLVED_SHARE = 0.1
 """Part of p from which what strata that are not resolved may add is worth a remark."""
 SETTLED = 1.8
-"""Upper end of a sum over its p up to which its run has converged: that of a c.o.v. of 0.3."""
+"""Upper limit of a sum over its p up to which its run has converged: that of a c.o.v. of 0.3."""
 WIDEST = 1000.0
-"""Upper end of an interval over its lower end from which on it says no more than its upper end; assumed."""
+"""Upper limit of an interval over its lower limit from which on it says no more than its upper limit; assumed."""
 FEW_SEARCHES = 10
 """Fewer independent searches reached failure, and ..."""
 POOR_RATE = 0.02
 """... each draw of the proposal is worth less than this part of a failure: then the regions found are badly described
-and others likely. Where f misleads searches, such runs gave 1e-11 with a c.o.v. of 0.1 for a p above 1e-8. Of 188
+and others likely. If f misleads searches, such runs gave 1e-11 with a c.o.v. of 0.1 for a p above 1e-8. Of 188
 searches of 4,000 simulations on the problems of the benchmark 7 were such, all with a c.o.v. above 0.15."""
 
 
@@ -414,13 +414,13 @@ def _settle(part: Part, confidence: float) -> Part:
 
 
 def may_add(parts: Sequence[Part], p: float) -> float:
-    """Return what parts that are not resolved may add to p > 0; 0 where that is less than a tenth of p."""
+    """Return what parts that are not resolved may add to p > 0; 0 if that is less than a tenth of p."""
     most = math.hypot(*(part.share * part.interval[1] for part in parts if not part.resolved))
     return most if most > UNRESOLVED_SHARE * p > 0 else 0.0
 
 
 def find_low_end(parts: Sequence[Part]) -> float:
-    """Return the lower end of the sum, which is that of the parts that are resolved."""
+    """Return the lower limit of the sum, which is that of the parts that are resolved."""
     known = [part for part in parts if part.resolved]
     below = math.hypot(*(part.share * (part.p - part.interval[0]) for part in known))
     return max(0.0, math.fsum(part.share * part.p for part in known) - below)
@@ -433,10 +433,10 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
 
         p - sqrt(sum_k (w_k (p_k - l_k))^2),    p + sqrt(sum_k (w_k (h_k - p_k))^2),
 
-    so that a part without a failure raises the upper end alone. What is said of such a part is a remark where other
-    parts failed: its upper end rests on the draws from its base. So does that of a part whose search found failures,
-    but too few to say how likely they are (`is_resolved`), and the lower end leaves its p_k out. A sum has converged
-    where all parts have and its own upper end is below 1.8 p.
+    so that a part without a failure raises the upper limit alone. What is said of such a part is a remark where other
+    parts failed: its upper limit rests on the draws from its base. So does that of a part whose search found failures,
+    but too few to say how likely they are (`is_resolved`), and the lower limit leaves its p_k out. A sum has converged
+    where all parts have and its own upper limit is below 1.8 p.
 
     References:
         Zou and Donner, "Construction of confidence limits about effect measures: a general approach", Statistics in
@@ -458,7 +458,7 @@ def sum_strata(parts: Sequence[Part], confidence: float, trace: tuple[Level, ...
         remarks += [f"{part.name}: {text}" for text in part.outcome.remarks]
     if most := may_add(parts, p):
         names = " and ".join(part.name for part in parts if not part.resolved)
-        remarks.append(f"{names} may add up to {most:.1e}; the c.o.v. is that of the failures met.")
+        remarks.append(f"{names} may add up to {most:.1e}; the relative error is that of the failures found.")
     simulated = [part for part in parts if part.n_sim]
     known = all(part.outcome.draw_weights for part in simulated)
     return Outcome(

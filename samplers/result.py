@@ -58,7 +58,7 @@ NEGLIGIBLE = 0.1
 """Share of the squared width of an interval below which its source does not limit it."""
 NAMED_STRATA = 2
 """Strata without enough failures that are named."""
-LEAST_ODDS = 1e-12
+LEAST_ODDS = 1e-9
 """Probability from which on it is also written as "1 in n"."""
 
 
@@ -83,8 +83,7 @@ class Estimate(EstimateData, Kept):
 
         M = 1 - (1 - confidence)^(1 / n) for n base draws, about 3 / n, the one-sided Clopper-Pearson bound without a
         hit: n draws all miss a larger region with probability under 1 - confidence. M = 1 without base draws. Levels
-        of f and chains may find far smaller regions, but guarantee nothing. Of a sum over strata, a region may lie in
-        several of them.
+        of f and chains may find far smaller regions, but guarantee nothing. A region may lie in several strata.
         """
         return self.bound_missed(self.confidence)
 
@@ -129,7 +128,7 @@ class Estimate(EstimateData, Kept):
         Every failing point counts with the ratio of the densities. That works near the old base: where the new one has
         its mass among points that were hardly drawn, the effective number of units drops and the answer is refused. A
         failure region that was never drawn from, because the old base gives it little or no density, cannot be seen,
-        and no interval shows it. Where `new_base` can be sampled, draws from it tell whether it reaches beyond the old
+        and no interval shows it. If `new_base` can be sampled, draws from it tell whether it reaches beyond the old
         support.
 
         Args:
@@ -156,16 +155,16 @@ class Estimate(EstimateData, Kept):
     def base_uncertainty(self) -> BaseUncertainty | None:
         """The interval of p that the events behind a fitted base distribution allow, from the same simulations.
 
-        None where the base has no refits; see `BaseUncertainty` and `samplers.analysis.FittedBase`.
+        None if the base has no refits; see `BaseUncertainty` and `samplers.analysis.FittedBase`.
         """
         return compute_base_uncertainty(self)
 
     def meets(self, max_p: float, given_base: bool = False) -> Verdict:
         """Return whether p is below a limit: it passes, fails, or is undecided.
 
-        Both ends of the interval (of `sequence`, where the run stopped on what it saw) are one-sided limits at the
-        confidence (1 + `confidence`) / 2: take `confidence=0.9` for a test at 95 %. Where the base distribution was
-        fitted, the ends hold the uncertainty that its events leave.
+        Both limits of the interval (of `sequence`, if the run stopped on what it saw) are one-sided at the confidence
+        (1 + `confidence`) / 2: take `confidence=0.9` for a test at 95 %. If the base distribution was fitted, they
+        include the uncertainty from few events.
 
         Args:
             max_p: The limit.
@@ -229,12 +228,12 @@ class Estimate(EstimateData, Kept):
     def sensitivity(self, names: Sequence[str] = (), sizes: Sequence[int] = (), parameters: bool = True) -> Sensitivity:
         """Return what p is sensitive to: parameters of the base distribution, and columns of x; no new simulations.
 
-        Where the base offers its parameters (`parameters`, `with_parameters`), d log p / d theta is the score function
-        averaged over the failing points. Where it also has refits, the spread of log p over them is split among the
+        If the base offers its parameters (`parameters`, `with_parameters`), d log p / d theta is the score function
+        averaged over the failing points. If it also has refits, the spread of log p over them is split among the
         parameters to first order, which tells what recordings would narrow the interval most.
 
         Args:
-            names: Of the parameters of x, for the tables; by default those of the problem, or x1, x2, ...
+            names: Names of the parameters of x, for the tables; by default those of the problem, or x1, x2, ...
             sizes: Columns of x that each takes; one by default.
             parameters: Whether derivatives by the parameters of the base are wanted too.
 
@@ -246,10 +245,10 @@ class Estimate(EstimateData, Kept):
 
     @property
     def proviso(self) -> str:
-        """What is not in p and its interval: what the problem holds fixed, and regions of failure that no draw met."""
+        """What is not in p and its interval: what the problem holds fixed, and failure regions that were missed."""
         fixed = f"given that {self.given}; " if self.given else ""
         by = f"({self.base_draws:,} base draws, {100 * self.confidence:g} % confidence)"
-        text = f"{fixed}a failure region that no draw met: below {self.unseen:.1e} {by}"
+        text = f"{fixed}a failure region that the search missed: below {self.unseen:.1e} {by}"
         wide = sum(n for _, n in self.wide_draws)
         if not wide:
             return text
@@ -265,7 +264,7 @@ class Estimate(EstimateData, Kept):
         finite = sample.f[np.isfinite(sample.f)]
         low = max(lowest_known_threshold(sample, self.gamma), finite.min(initial=math.inf))
         if not math.isfinite(low):
-            raise ValueError("There is nothing to draw: too few simulations came near failure; give more of them.")
+            raise ValueError("There is nothing to draw: too few simulations came near failure; raise max_sim.")
         order = np.argsort(finite)
         reached = np.cumsum(sample.weights[np.isfinite(sample.f)][order])
         high = float(finite[order][min(np.searchsorted(reached, reached[-1] / 2), len(order) - 1)])
@@ -281,7 +280,7 @@ class Estimate(EstimateData, Kept):
 
     @property
     def headline(self) -> str:
-        """P in words or, where p = 0, the bound and what it rests on."""
+        """P in words or, if p = 0, the bound and what it rests on."""
         if self.p > 0:
             return f"P[f <= {self.gamma:g}] = {self.p:.3e}"
         failing = f"only {self.failures.total:,} of the search" if self.failures.total else "no failure"
@@ -308,7 +307,7 @@ class Estimate(EstimateData, Kept):
             P[f <= 0] = 2.370e-02
               95 % interval [2.081e-02, 2.687e-02], c.o.v. 0.0642
               10,000 simulations, gain over Monte Carlo 1; mc, seed 0, converged; 237 failing points
-              a failure region that no draw met: below 3.0e-04 (10,000 base draws, 95 % confidence)
+              a failure region that the search missed: below 3.0e-04 (10,000 base draws, 95 % confidence)
         """
         (low, high), looks = self.interval, self.sequence
         gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
@@ -331,7 +330,7 @@ class Estimate(EstimateData, Kept):
         """Return simulated points with their weights as an Arrow table, a row each.
 
         With `estimate(..., keep_points=True)` these are all simulations in their order: `f`, `weight` (its share in p
-        where it fails; null for those of a search, and for Markov chains, whose points stand for each other), `run`
+        if it fails; null for those of a search, and for Markov chains, whose points stand for each other), `run`
         (replicate), `stage` (level in its trace), `failed` and the coordinates of x. Otherwise they are the points
         behind p (`Estimate.sample`): `f`, `weight`, `unit` and `failed` of all, and x of the failing ones, null
         elsewhere. The folder of a run of `rare-envs estimate --out` has the first table as `episodes.parquet`
@@ -377,7 +376,7 @@ class Estimate(EstimateData, Kept):
         """Return the estimate that `save` has written.
 
         Args:
-            path: Of the file, in the format safetensors with JSON in its metadata.
+            path: Path of the file, in the format safetensors with JSON in its metadata.
             base: The base distribution (`problem.base`), which `reweight` and `sensitivity` need; `base_uncertainty`
                 is kept without it. A method of another package comes back as its name and settings.
 
@@ -501,16 +500,16 @@ def _describe_p(estimate: Estimate, noun: str) -> str:
     if LEAST_ODDS < estimate.p < 0.1:
         odds = f" (1 in {float(f'{1 / estimate.p:.2g}'):,.0f}{noun and f' {noun}'})"
     p, below, above = format_alike(estimate.p, low, high)
-    return say("p" if low > 0 else "p without a lower limit", p=p, odds=odds, low=below, high=above, sure=sure)
+    fact = "p" if low > 0 else "p without a lower limit" if high < 1 else "p without limits"
+    return say(fact, p=p, odds=odds, low=below, high=above, sure=sure)
 
 
 def _describe_limit(estimate: Estimate, model: str) -> str:
     """Return whether the events behind the base distribution or the simulations make the interval as wide as it is."""
     base, n, vague = estimate.base_uncertainty, f"{estimate.n_sim:,}", [p for p in estimate.parts if not p.resolved]
     ends = sorted(((part.share * part.interval[1], part.name) for part in vague), reverse=True)
-    parts = [f"{part} (below {format_alike(high)[0]})" for high, part in ends[:NAMED_STRATA]]
-    parts += [f"{len(ends) - NAMED_STRATA} more strata"] if len(ends) > NAMED_STRATA else []
-    few = say("too few in strata", strata=" and ".join(parts)) if parts else ""
+    few = "".join(say("too few failures", name=part, high=format_alike(high)[0]) for high, part in ends[:NAMED_STRATA])
+    few += f"; {len(ends) - NAMED_STRATA} more strata" if len(ends) > NAMED_STRATA else ""
     of_events = 1 - _share_of_simulations(estimate)
     if base is None or of_events < NEGLIGIBLE:
         return say("limited by simulations", n=n, few=few)

@@ -92,7 +92,7 @@ class RunArguments:
     replicates: int = 1
     """Independent runs, side by side."""
     on_error: OnError = "raise"
-    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing in p and the upper end only."""
+    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing but for the lower limit."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -162,7 +162,7 @@ def check_problem(problem: Inputs, *needed: str) -> None:
 
 
 def choose_seed(seed: int | None) -> int:
-    """Return the seed, or a random one where there is none, short enough to type."""
+    """Return the seed, or a random one if there is none, short enough to type."""
     return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
 
 
@@ -293,7 +293,7 @@ class Run:
         self.answer(np.split(one_per_row(f, int(ends[-1])), ends[:-1]))
 
     def answer(self, answers: Sequence[Answer]) -> None:
-        """Take the answers to `requests`, in their order: f, or terms and gradients where the run offers them.
+        """Take the answers to `requests`, in their order: f, or terms and gradients if the run offers them.
 
         Raises:
             EvaluationError: If an f is NaN (on_error "raise"), or gradients cost more than they may.
@@ -392,18 +392,18 @@ class Run:
             for part in whole.parts
         )
         if self._n_errors:
-            where = " (not in the lower end of the interval)" if self._on_error == "bound" else ""
+            where = " (not in the lower limit of the interval)" if self._on_error == "bound" else ""
             warnings.append(f"{self._n_errors} simulations gave no outcome and were counted as failing{where}.")
         if self._stopped is not None:
             status = Status.STOPPED
             warnings.append(self._stopped)
-        elif not met:  # the interval holds, and is wider than was wished
+        elif not met:  # the interval is right, and wider than the target
             status = Status.BUDGET if status is Status.CONVERGED else status
-            remarks.append(f"The target c.o.v. {goal.target_cov:g} was not met: {whole.cov:.3g}.")
+            remarks.append(f"The target relative error {goal.target_cov:g} was not met: {whole.cov:.3g}.")
         if whole.p == 0:
             remarks.append(advise(self._n_sim, self._closest))
         if whole.p > 0.5:
-            remarks.append(f"Most x have f <= {goal.gamma:g}, which counts as failing: where large f is, give -f.")
+            remarks.append(f"Most x have f <= {goal.gamma:g}, which is failure. If large f is dangerous, return -f.")
         number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
         found = {"status": status, "warnings": tuple(warnings), "remarks": tuple(remarks), "parts": parts}
         interval = self._find_ends(whole)
@@ -426,7 +426,7 @@ class Run:
         )
 
     def _find_ends(self, outcome: Outcome) -> Interval:
-        """Return the interval; points without an outcome that only bound p are not in its lower end."""
+        """Return the interval; points without an outcome that only bound p are not in its lower limit."""
         (low, high), known = outcome.interval, 1 - outcome.no_outcome_share
         if self._on_error != "bound":
             return low, high
@@ -438,11 +438,11 @@ class Run:
         return clopper_pearson(round(hits * known), n, self._goal.confidence)[0], high
 
     def _keep_known(self, outcome: Outcome) -> Outcome:
-        """Return the outcome of a part with p and the lower end of the failures that have an outcome."""
+        """Return the outcome of a part with p and the lower limit of the failures that have an outcome."""
         return replace(outcome, p=outcome.p * (1 - outcome.no_outcome_share), interval=self._find_ends(outcome))
 
     def _find_sequence(self, whole: Outcome, interval: Interval) -> Interval | None:
-        """Return the ends that hold at every look, around the interval; None where the run stops on nothing seen."""
+        """Return the ends that hold at every look, around the interval; None if the run stops on nothing seen."""
         target = self._goal.target_cov or getattr(self._named, "own_target", None)
         if target is None or not (0 < whole.p < 1 and 0 < whole.cov < math.inf):
             return None

@@ -61,7 +61,7 @@ class Status(str, Enum):
     """It came to its end without seeing a failure: p = 0, one-sided interval."""
     BUDGET = "budget"
     """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met, or a sum
-    over strata has an upper end above 1.8 p."""
+    over strata has an upper limit above 1.8 p."""
     STOPPED = "stopped"
     """Someone stopped it: the time limit or a callback."""
     STALLED = "stalled"
@@ -71,15 +71,15 @@ class Status(str, Enum):
         return str(self.value)
 
 
-COARSE = "the estimate is coarse"
-"""Words of the warnings that say how coarse p is, which its interval holds; other warnings say that it may be wrong."""
+COARSE = "the estimate is imprecise"
+"""Words of the warnings that say how imprecise p is, as its interval shows; others say that it may be wrong."""
 
 
 def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
-    """Return how a run ended, in words: "converged" stands alone only where there is no warning."""
+    """Return how a run ended, in words: "converged" stands alone only if there is no warning."""
     if status != Status.CONVERGED or not warnings:
         return str(status)
-    return f"came to its end with {len(warnings)} warning{'s' * (len(warnings) != 1)}"
+    return f"finished with {len(warnings)} warning{'s' * (len(warnings) != 1)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,7 @@ class Level:
     run: int = 0
     """Number of the replicate that the level belongs to."""
     stratum: str = ""
-    """Stratum that it belongs to, whose own probability `estimate` is; empty where the base has none."""
+    """Stratum that it belongs to, whose own probability `estimate` is; empty if the base has none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -192,11 +192,11 @@ class Sample:
     passed early: p there rests on all points of that level, not on the few of them that the next ones descend from."""
     lineages: float = math.inf
     """Independent searches that reached failure, where p rests on a proposal that was fitted to what they found: the
-    upper end of p holds the share that they may have missed. inf without a search."""
+    upper limit of p holds the share that they may have missed. inf without a search."""
 
     @property
     def all_layers(self) -> tuple[Layer, ...]:
-        """The layers; the sample itself as one where it has none."""
+        """The layers; the sample itself as one if it has none."""
         return self.layers or (Layer(f=self.f, weights=self.weights, units=self.units),)
 
     @classmethod
@@ -221,7 +221,7 @@ class SimulatedPoints:
     x: FloatArray
     """Points, shape (n, d), in physical space."""
     f: FloatArray
-    """Outcomes, shape (n,); NaN where f raised or gave NaN."""
+    """Outcomes, shape (n,); NaN if f raised or gave NaN."""
 
     @classmethod
     def join(cls, parts: Sequence[tuple[FloatArray, FloatArray]], dim: int) -> SimulatedPoints:
@@ -256,7 +256,7 @@ class Failure(NamedTuple):
     x: FloatArray
     """The point, shape (d,)."""
     f: float
-    """Its outcome; NaN where f raised or gave NaN and was counted as failing."""
+    """Its outcome; NaN if f raised or gave NaN and was counted as failing."""
     log_p0: float
     """Log density under the base distribution."""
 
@@ -280,7 +280,7 @@ class Failures:
     x: FloatArray
     """Points, shape (m, d)."""
     f: FloatArray
-    """Outcomes, shape (m,); NaN where f raised or gave NaN and was counted as failing."""
+    """Outcomes, shape (m,); NaN if f raised or gave NaN and was counted as failing."""
     log_p0: FloatArray
     """Log density under the base distribution, shape (m,), falling."""
     total: int
@@ -339,7 +339,7 @@ def effective_sample_size(log_weights: FloatArray) -> float:
 
 
 def effective_number(terms: FloatArray) -> float:
-    """Return the effective number of terms (n,), (sum t)^2 / sum t^2; 0 where all are 0."""
+    """Return the effective number of terms (n,), (sum t)^2 / sum t^2; 0 if all are 0."""
     total, squares = float(terms.sum()), float((terms**2).sum())
     return total**2 / squares if squares > 0 else 0.0
 
@@ -415,7 +415,7 @@ def confidence_sequence(p: float, interval: Interval, cov: float, target_cov: fl
         sigma sqrt(2 (n rho^2 + 1) / (n^2 rho^2) log(sqrt(n rho^2 + 1) / alpha)),    rho fixed beforehand,
 
     which is sigma / sqrt(n) times a factor of v = n rho^2. Here sigma / sqrt(n) is the c.o.v., distances are those from
-    log p (from p itself, upper ends of skew weights are too low), and n counts effective failures, 1 / cov^2: at
+    log p (from p itself, upper limits of skew weights are too low), and n counts effective failures, 1 / cov^2: at
     v = v0 (target_cov / cov)^2 the factor is least at the target, 1.55 times the normal quantile at 95 %, with
     v0 = a + log(a) + 1, a = -2 log(alpha). The distances of the interval's own ends, whatever they allow for, are
     multiplied by the factor over that quantile. The first failures need no other rule: at one the factor is above 10,
@@ -430,7 +430,7 @@ def confidence_sequence(p: float, interval: Interval, cov: float, target_cov: fl
 
 
 def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -> float:
-    """Return the upper end of a mean p whose distribution is skew, by Hall's transformation; at most 1.
+    """Return the upper limit of a mean p whose distribution is skew, by Hall's transformation; at most 1.
 
     With g the skewness of the mean (that of a term over sqrt(n), here cut to [0, MAX_SKEWNESS]) and z the normal
     quantile, the end is p (1 + 3 cov / g (1 - (1 - g (z + g / 6))^(1/3))).
@@ -449,12 +449,12 @@ def degrees_of_freedom(ess: float, independent: bool) -> float:
 
 
 def binomial_cov(p: float, n: float) -> float:
-    """Return the c.o.v. of a share p of n independent points; inf where p = 0."""
+    """Return the c.o.v. of a share p of n independent points; inf if p = 0."""
     return math.sqrt((1 - p) / (p * n)) if p > 0 else math.inf
 
 
 def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
-    """Return Monte Carlo runs for the same c.o.v. over n_sim; NaN where p is 0, 1 or not known (c.o.v. from 1 on)."""
+    """Return Monte Carlo runs for the same c.o.v. over n_sim; NaN if p is 0, 1 or not known (c.o.v. from 1 on)."""
     if not 0 < p < 1 or not 0 < cov < 1 or n_sim == 0:
         return math.nan
     return (1 - p) / (p * cov * cov * n_sim)
@@ -468,7 +468,7 @@ def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
     """Return the next threshold for outcomes f (n,), or None if there is none to go to.
 
     gamma as soon as the fraction is reached by f <= gamma. Otherwise the `fraction` quantile q, an outcome that
-    occurred. Where many outcomes tie at q, the largest distinct outcome below q is taken if its share is nearer (in
+    occurred. If many outcomes tie at q, the largest distinct outcome below q is taken if its share is nearer (in
     ratio) or if q would keep more than half of the points.
     """
     n = len(f)
@@ -491,7 +491,7 @@ QUANTILES = 400
 
 
 def add_unseen(p: float, high: float, lineages: float, confidence: float) -> float:
-    """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages.
+    """Return the upper limit of p, `high` for the regions known, with the share that is unseen after some lineages.
 
     Of nu independent lineages that reached failure, all in the regions known, each is a trial that a region of share M
     is missed with probability 1 - M: M ~ Beta(1/10, nu), since most problems have no other region. The end is the
@@ -503,7 +503,7 @@ def add_unseen(p: float, high: float, lineages: float, confidence: float) -> flo
 
 
 def raise_log_end(half: float, lineages: float, confidence: float) -> float:
-    """Return how far the upper end of log p lies above its estimate, `half` without the share that is unseen."""
+    """Return how far the upper limit of log p lies above its estimate, `half` without the share that is unseen."""
     if np.isinf(lineages):
         return half
     tail = 0.5 + confidence / 2

@@ -69,10 +69,10 @@ class StratifiedProblem:
     `estimate` gives every stratum runs of its own and most simulations to those that the error of the sum comes from;
     `Estimate.parts` has each p_k. The first column of x is `stratum`: k + v for stratum k = 0, 1, ... and v uniform
     below 1, which does not matter to f_k; then come the columns of its problem, and standard normal ones up to the
-    length of the longest. Where the base of a problem has strata of its own, these are strata of the sum, "cut-in:
+    length of the longest. If the base of a problem has strata of its own, these are strata of the sum, "cut-in:
     unseen" say. Terms of problems are not offered. Where shares have an error (`Stratum.log_sd`) or bases
     were fitted, the base has refits: a share with an error is log-normal, those without take what is left, in
-    proportion, and where all have one they are scaled to add up to 1.
+    proportion, and if all have one they are scaled to add up to 1.
 
     Args:
         strata: The problems with their shares, which add up to 1.
@@ -253,7 +253,7 @@ class StratifiedBase(DrawnByItsMap):
 
     @cached_property
     def refits(self) -> tuple[StratifiedBase, ...]:
-        """The same strata with other shares and the refits of their bases; none where nothing has an error."""
+        """The same strata with other shares and the refits of their bases; none if nothing has an error."""
         sds = np.array([each.log_sd or 0.0 for each in self.problems])
         n = max([N_REFITS if sds.any() else 0, *(len(fitted.refits) for fitted in self._fitted)])
         if self.refit is not None or n == 0:

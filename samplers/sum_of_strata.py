@@ -2,7 +2,7 @@
 
 Every stratum has runs of its own under its own base distribution. First come pilots, a quarter of the simulations in
 equal parts. The rest goes to the strata by Neyman's rule, in proportion to w_k times the width of the interval of p_k
-for one simulation: that is its standard deviation where failures were met, and what may be there where none was. One
+for one simulation: that is its standard deviation where failures were met, and what may be there if none was. One
 whose part of the rest is no larger than its pilot keeps the pilot; any other has a new run, and p_k is
 that of the new run alone, so that the pilot decides how large the run is and adds nothing to it. Only where the new run
 meets no failure and the pilot did, both count, by their simulations: so p is a little too high where failures are few.
@@ -12,15 +12,15 @@ few they are.
 
 With a target c.o.v. t the pilots stop at a c.o.v. of 0.3, and runs follow in strata whose own c.o.v. is above
 t / sqrt(w_k p_k / p): if all keep to that, the sum has a c.o.v. of t. A stratum without a failure goes on, as far as
-max_sim allows, while it may add more than is known: w_k h_k > p, with h_k the upper end of its p_k.
+max_sim allows, while it may add more than is known: w_k h_k > p, with h_k the upper limit of its p_k.
 
-Where nothing fails in a stratum, or too little to be believed (`samplers.replicate.is_resolved`), simulations that are
-left are plain draws, which bring its upper end down: so are the `plain_draws` that a problem offers where there is no
+If nothing fails in a stratum, or too little to be believed (`samplers.replicate.is_resolved`), simulations that are
+left are plain draws, which bring its upper limit down: so are the `plain_draws` that a problem offers if there is no
 max_sim, as it does where they take seconds.
 
-Where the method is `Auto`, pilots are plain draws, and a stratum in which 0.004 of them failed goes on with plain
+If the method is `Auto`, pilots are plain draws, and a stratum in which 0.004 of them failed goes on with plain
 draws: a search gains little there, and it may miss one of many regions. So do strata that cannot add a tenth of p, and
-all where there are not 300 simulations for a search of each of the others. Without max_sim and target a sum has 7,000
+all if there are not 300 simulations for a search of each of the others. Without max_sim and target a sum has 7,000
 simulations for each stratum, 1,000 of them in its pilot; 6,000 for each search, and the rest where the error is.
 
 References:
@@ -61,7 +61,7 @@ PILOT_SHARE = 0.25
 FEWEST = 20
 """Simulations for each stratum up to which there are no pilots: all are made at once, in equal parts."""
 PILOT_DRAWS = 1000
-"""Draws of a pilot of plain draws where there is no max_sim."""
+"""Draws of a pilot of plain draws if there is no max_sim."""
 OFTEN = 0.004
 """Share of the draws of a pilot that fails from which its stratum needs no search: it would gain a factor of 2 ..."""
 FEWEST_HITS = 2
@@ -72,14 +72,14 @@ LEAST_SEARCH = 300
 may meet nothing where plain draws do: as what met a failure counts, p would be too large on average, by a third with
 100 simulations."""
 PILOT_COV = 0.3
-"""C.o.v. at which pilots stop where there is a target; a larger target takes its place."""
+"""C.o.v. at which pilots stop if there is a target; a larger target takes its place."""
 MARGIN = 0.9
 """Part of a target c.o.v. that a stratum is given: the sum's own p is not yet known."""
 MOST_ROUNDS = 6
 """Rounds of runs for a target, pilots aside."""
 PLENTY = 6000
 """Simulations for the search of a stratum whose pilot resolved nothing; further ones are plain draws, which all count
-in its upper end."""
+in its upper limit."""
 LEAST_GAIN = 0.1
 """Plain draws are made where they are more than this part of the simulations made."""
 
@@ -91,7 +91,7 @@ class SumOfStrata:
     method: Stepping
     strata: tuple[Any, ...]
     plain_draws: int = 0
-    """Plain draws that are made beyond the method's own simulations where nothing fails and there is no max_sim."""
+    """Plain draws that are made beyond the method's own simulations if nothing fails and there is no max_sim."""
 
     name: ClassVar[str] = "strata"
     stops_at_target: ClassVar[bool] = True
@@ -114,7 +114,7 @@ class _Sum:
         nothing = replace(
             NOT_KNOWN,
             status=Status.BUDGET,
-            warnings=("It was not simulated, for lack of simulations: p = 0 stands for not known.",),
+            warnings=("It was not simulated, as max_sim was used up: p = 0 means not known.",),
         )
         self.parts = [Part(name=one.name, share=float(one.share), outcome=nothing) for one in self.strata]
         self.behind = np.zeros(len(self.strata))
@@ -122,7 +122,7 @@ class _Sum:
         self.trace = list[Level]()
         self.n_sim, self.stopped, self.at_limit = 0, False, set[int]()
         self.most = goal.max_sim
-        """Simulations that are planned; None where a target, a method or the time of plain draws says when to end."""
+        """Simulations that are planned; None if a target, a method or the time of plain draws says when to end."""
         if self.most is None and goal.target_cov is None and self.chooses and not self.plain_draws:
             self.most = len(self.strata) * (PILOT_DRAWS + PLENTY)
         self.searched = set[int]()
@@ -148,7 +148,7 @@ class _Sum:
         return whole
 
     def _plan_pilots(self) -> list[Task]:
-        """Return a first run for every stratum, or for the largest ones where there are fewer simulations."""
+        """Return a first run for every stratum, or for the largest ones if there are fewer simulations."""
         k, n, target = len(self.parts), self.goal.max_sim, self.goal.target_cov
         target = max(target, PILOT_COV) if target is not None and self.method.stops_at_target else None
         method = PlainDraws() if self.chooses else None
@@ -214,7 +214,7 @@ class _Sum:
         return PlainDraws() if self.chooses and (self._fails_often(stratum) or in_vain) else None
 
     def _has_draws_next(self, stratum: int) -> bool:
-        """Return whether plain draws come next in a stratum that is not resolved: all count in its upper end."""
+        """Return whether plain draws come next in a stratum that is not resolved: all count in its upper limit."""
         return self._is_unresolved(stratum) and self._find_method(stratum) is not None
 
     def _is_unresolved(self, stratum: int) -> bool:
@@ -320,7 +320,7 @@ class _Sum:
         return replace(found, base_draws=drawn), n
 
     def _bound(self, nothing: Outcome, drawn: int) -> Outcome:
-        """Return an outcome without a failure, with the upper end of all base draws, those of a search included."""
+        """Return an outcome without a failure, with the upper limit of all base draws, those of a search included."""
         interval = clopper_pearson(0, drawn, self.goal.confidence)
         about = f"None of {drawn:,} base draws failed: p = 0 with a one-sided interval."
         return replace(nothing, interval=interval, base_draws=drawn, warnings=(about,))

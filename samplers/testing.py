@@ -84,7 +84,7 @@ def check_seed(method: Stepping) -> None:
 
 
 def check_no_failure(method: Stepping) -> None:
-    """Check that p = 0 with a one-sided interval and a warning where nothing fails, also where f goes downhill."""
+    """Check that p = 0 with a one-sided interval and a warning if nothing fails, also where f goes downhill."""
 
     def falling(slope: float, x: FloatArray) -> FloatArray:
         return 30.0 - slope * x[:, 0]
@@ -110,7 +110,7 @@ def check_failure_everywhere(method: Stepping) -> None:
 
 
 def check_outcomes(method: Stepping) -> None:
-    """Check p where f ties at gamma, which is failure, where it is infinite, and where rows have no outcome."""
+    """Check p if f ties at gamma, which is failure, where it is infinite, and if rows have no outcome."""
     for what, f, gamma, seeds in (
         ("whole numbers", lambda x: np.floor(x[:, 0] + 4.5), 2.0, range(5)),
         ("infinite outcomes", lambda x: np.where(x[:, 0] > 1.5, -np.inf, np.inf), 0.0, (1,)),
@@ -182,7 +182,7 @@ def check_accuracy(method: Stepping) -> None:
     allowed = 0.1 + 4 * ratios.std(ddof=1) / math.sqrt(10)
     _expect(abs(ratios.mean() - 1) < allowed, method, f"mean of 10 runs is {ratios.mean():.3g} times the true p")
     held = sum(result.interval[0] <= reference.p <= result.interval[1] for result in results)
-    _expect(held >= 6, method, f"{held} of 10 intervals hold the true p")
+    _expect(held >= 6, method, f"{held} of 10 intervals cover the true p")
 
 
 METHOD_CHECKS: tuple[Callable[[Stepping], None], ...] = (
@@ -222,7 +222,7 @@ def _expect_sound(method: Stepping, result: Estimate, rows: int) -> None:
     _expect(0 <= drawn <= rows, method, f"expected at most {rows} base draws, the result has {drawn}")
     _expect(0 < result.unseen <= 1, method, f"expected unseen in (0, 1], got {result.unseen}")
     _expect(result.cov >= 0, method, f"expected a c.o.v. of at least 0, got {result.cov}")
-    _expect(result.p > 0 or high > 0, method, "p = 0 is never certain: expected an upper end above 0")
+    _expect(result.p > 0 or high > 0, method, "p = 0 is never certain: expected an upper limit above 0")
 
 
 def _expect_near(method: Stepping, result: Estimate, p: float, what: str) -> None:

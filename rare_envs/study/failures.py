@@ -246,13 +246,13 @@ LEAST_CLUSTERED = 0.5
 """Share of the failures that must lie in clusters; fewer are the tails of one."""
 KIND_DESCRIPTIONS = MappingProxyType(
     {
-        "rear_end": "the ego runs into a vehicle ahead",
-        "rear_ended": "the ego is run into from behind",
-        "side": "flank against flank",
-        "road_edge": "the ego leaves the road",
-        "others": "other vehicles collide",
-        "none": "nobody collides",
-        "no outcome": "the ego failed",
+        "rear_end": "rear-end (ego strikes)",
+        "rear_ended": "rear-end (ego struck)",
+        "side": "sideswipe",
+        "road_edge": "road departure",
+        "others": "crash of other vehicles",
+        "none": "no collision",
+        "no outcome": "no answer from the ego",
     }
 )
 """Kinds of crash in words."""

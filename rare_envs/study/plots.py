@@ -33,7 +33,7 @@ from rare_envs.study import run_folder
 from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
 from rare_envs.study.events import EventRate
-from rare_envs.study.replay import Drive, drive_again, name_parties
+from rare_envs.study.replay import Drive, describe_contact, drive_again
 from rare_envs.study.report import Report
 from rare_envs.study.text import EVENT_NOUNS, format_with_interval, name_measure
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -139,7 +139,7 @@ def _draw_likeliest(figure: Figure, report: Report, x: FloatArray) -> None:
         message = f"the failure cannot be shown: {reason_of(error)}"
         axes.text(0.5, 0.5, message, ha="center", va="center", wrap=True, transform=axes.transAxes)
         return
-    how = "no crash" if drive.crash is None else "{} into {}".format(*name_parties(drive.crash, drive.names))
+    how = "no crash" if drive.crash is None else describe_contact(drive.crash, drive.names)
     figure.suptitle(f"The most likely failure: {how}", fontweight="bold")
     for axes, t in zip(figure.subplots(MOMENTS, 1), choose_moments(drive), strict=True):
         draw_moment(axes, drive, t)

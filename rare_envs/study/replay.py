@@ -218,9 +218,8 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: st
     if crash is None:
         lines.append(f"No crash within {end:.1f} s; the worst moment was at {drive.time[drive.worst]:.1f} s.")
     else:
-        who, whom = name_parties(crash, drive.names)
-        how = f"{crash['kind']}, closing at {crash['closing_speed']:.1f} m/s"
-        lines.append(f"Crash after {end:.1f} s: {who} into {whom} ({how}).")
+        how = f"{describe_contact(crash, drive.names)}, closing at {crash['closing_speed']:.1f} m/s"
+        lines.append(f"Crash after {end:.1f} s: {how}.")
     if ego is not None:
         lines.append(f"The ego was {ego}; that of the run had f = {recorded.f:.4g}.")
     elif abs(drive.f - recorded.f) > REPLAY_TOLERANCE:
@@ -231,6 +230,11 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: st
     return lines
 
 
-def name_parties(crash: Mapping[str, Any], labels: Sequence[str]) -> list[str]:
-    """Return who ran into whom in a crash, by the labels of the vehicles."""
-    return ["the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"]]
+VERBS = {"rear_end": "rear-ends", "rear_ended": "rear-ends", "side": "sideswipes"}
+"""What the first vehicle of a crash does to the second, by the kind of crash; "hits" in others."""
+
+
+def describe_contact(crash: Mapping[str, Any], labels: Sequence[str]) -> str:
+    """Return who ran into whom in a crash, and how, by the labels of the vehicles."""
+    who, whom = ("the edge of the road" if one < 0 else labels[one] for one in crash["vehicles"])
+    return f"{who} {VERBS.get(crash['kind'], 'hits')} {whom}"

@@ -97,11 +97,11 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> str:
     """Return which error the intervals leave out, and why; empty if they hold all."""
     base, reason = estimate.base_uncertainty, ""
     if study.question.ensemble:
-        reason = "p is the mean over its refits, which stands for it"
+        reason = "p is a mean over its bootstrap refits instead"
     elif estimate.p == 0:
-        reason = "which is not known without a failure that counts"
+        reason = "not known before a failure counts in p"
     else:
-        reason = "it has no refits" if base is None else base.reason
+        reason = "it has no bootstrap refits" if base is None else base.reason.rstrip(".")
     return say("error not known", model=MODEL_NOUN, reason=reason) if reason else ""
 
 
@@ -210,7 +210,7 @@ class Report:
     def warnings(self) -> tuple[str, ...]:
         """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
-        doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
+        doubts = () if base is None else tuple(f"{MODEL_NOUN}: {text}" for text in base.warnings)
         return (*self.doubts_of_method, *doubts, *self.doubts_of_f)
 
     @property

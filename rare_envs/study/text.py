@@ -13,17 +13,19 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.text import Text
+from scipy.special import ndtri
 
 import samplers
 from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
 from rare_envs.plugins import clean_text
+from rare_envs.scenarios.cut_in import ATTENTION_LIMIT, CUTTER
 from rare_envs.study.arguments import GATE_CODES, Question
-from rare_envs.study.episodes import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value, list_columns
+from rare_envs.study.episodes import MAX_SHOWN, Column, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.study.failures import KIND_DESCRIPTIONS
-from rare_envs.study.replay import name_parties
+from rare_envs.study.replay import describe_contact
 from rare_envs.study.report import MODEL_NOUN, Report, describe_left_out, explain_other_events
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows, format_alike, indent_lines, say
 from samplers.problem import FloatArray
@@ -84,7 +86,7 @@ def describe_people(counted: people.HumanBenchmark | None) -> str:
 
 
 def describe_rate(each: EventRate) -> str:
-    """Return the rate of an event per million km with its interval, or its upper end where it is not resolved."""
+    """Return the rate of an event per million km with its interval, or its upper limit if too few failed."""
     ends = each.rate.interval_per_million_km
     if each.event in each.unresolved:
         return f"below {format_rate(ends[1])}"
@@ -112,14 +114,14 @@ def describe_calibration(each: EventRate) -> str:
 
 
 def describe_parts(shares: Mapping[str, float], unresolved: Mapping[str, float]) -> str:
-    """Return the shares of strata in a rate, the largest first, and the upper ends of those that are not resolved.
+    """Return the shares of strata in a rate, the largest first, and the upper limits of those with too few failures.
 
-    "of which unseen 92 %, looked 8 %", or "of which unseen 100 %; looked is not resolved, below 2.6".
+    "of which unseen 92 %, looked 8 %", or "of which unseen 100 %; stratum looked: too few failures found, below 2.6".
     """
     ordered = sorted(shares.items(), key=lambda part: -part[1])
     known = ", ".join(f"{name} {format_share(share)}" for name, share in ordered if name not in unresolved)
-    vague = [f"{name} is not resolved, below {format_rate(high)}" for name, high in unresolved.items()]
-    return "; ".join([*([f"of which {known}"] if known else []), *vague])
+    vague = (say("too few failures", name=name, high=format_rate(high)) for name, high in unresolved.items())
+    return "".join([*([f"of which {known}"] if known else []), *vague]).removeprefix("; ")
 
 
 def tabulate(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -165,12 +167,13 @@ def describe_uncertainty(total: exposure.TotalRate) -> str:
     parts = []
     if total.shares:
         whole = len(total.determined) == len(total.rates)
-        of_what = "the uncertainty" if whole else "the uncertainty of the determined part"
+        of_what = "the uncertainty" if whole else "the uncertainty of the others"
         sources = ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in total.shares)
         parts.append(f"{of_what} is {sources}")
     for rate in (each for each in total.rates if not each.determined):
         high = format_rate(rate.interval_per_million_km[1])
-        parts.append(f"{name_scenario(rate.scenario)} is not determined, and adds {high} to the upper end")
+        few = say("too few events", what="a lower limit")
+        parts.append(f"{name_scenario(rate.scenario)} has {few} and adds {high} to the upper limit")
     return "; ".join(parts)
 
 
@@ -200,10 +203,10 @@ def format_probability(p: float | None, like: float | None = None) -> str:
 def explain_no_gain(p: float, resolved: bool) -> str:
     """Return why there is no gain over Monte Carlo; of sums whether all strata are resolved."""
     if p <= 0:
-        return "not known, as nothing that failed counts in p"
+        return "not known, as no failure counts in p"
     if not resolved:
-        return "not known, as a stratum is not resolved"
-    return "none, as every scenario fails" if p >= 1 else "not known, as the c.o.v. is 1 or more"
+        return "not known, as too few failures were found in a stratum"
+    return "none, as every scenario fails" if p >= 1 else "not known, as the relative error is 1 or more"
 
 
 def describe_kind(kind: str) -> str:
@@ -227,6 +230,24 @@ class CleanConsole(Console):
         return super().render_str(clean_text(text), **how)
 
 
+PLAIN_NAMES = {
+    "ego_speed": "ego at",
+    "speed": "both at",
+    "lead_speed": "lead at",
+    "cut_in_speed": "cutter at",
+    "duration": "lane change in",
+    "peak": "lead brakes at",
+    "loss": "lead loses",
+}
+"""Words before the value of a parameter, in place of its name."""
+IN_WORDS = {
+    "cut_in_gap": (0.0, "the cutter starts beside the ego"),
+    "attention": (ATTENTION_LIMIT, "the cutter does not look"),
+    "indicator": (float(ndtri(1 - CUTTER.indicating)), "the cutter does not signal"),
+    **dict.fromkeys(("noticing", "lead_braking", "lead_peak", "lead_loss"), (-math.inf, "")),
+}
+"""Parameters of a cut-in: the value below which words say more than it, and the words; standard normal ones have none
+above."""
 N_UNUSUAL = 3
 """Parameters of the most likely failure that are named at most."""
 NAMED_SHARE = 1e-4
@@ -304,7 +325,7 @@ def list_details(report: Report, out: Path | None = None) -> Iterator[str]:
     """Yield all intervals, the method and its effort, all parameters of the most likely failure, and all remarks."""
     estimate, question = report.estimate, report.study.question
     warned = replace(estimate, warnings=report.doubts_of_method, remarks=report.remarks)
-    yield from ("", *warned.details().splitlines())
+    yield from ("", *warned.details().replace("base distribution", MODEL_NOUN).splitlines())
     earlier = f" ({report.earlier_seconds:.0f} s before it was resumed)" if report.earlier_seconds else ""
     made_by = f"{question.core}{'' if question.device == 'cpu' else f' on {question.device}'}"
     yield f"  {report.seconds:.1f} s{earlier} by {made_by}"
@@ -315,7 +336,7 @@ def list_details(report: Report, out: Path | None = None) -> Iterator[str]:
     if question.method != "mc" and ENOUGH / MANY <= estimate.p < estimate.unseen:
         place = 10 ** math.floor(math.log10(ENOUGH / estimate.p))
         n = place * math.ceil(ENOUGH / estimate.p / place)
-        yield f"check: --method mc --max-sim {n} does not rely on a search"
+        yield f"check: --method mc --max-sim {n} is plain Monte Carlo, without a search"
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         yield f"written to {out}: {names}"
@@ -368,10 +389,10 @@ def _describe_end(report: Report, k: int) -> str:
     """Return how a failure ends: its crash, or its f."""
     crash, f = report.crashes[k], report.estimate.failures.f[k]
     if crash is None:
-        return "the ego failed" if math.isnan(f) else f"f = {f:.3g}"
-    who, whom = name_parties(crash, report.study.problem.world.scenario.labels)
+        return "the ego gave no answer" if math.isnan(f) else f"f = {f:.3g}"
+    contact = describe_contact(crash, report.study.problem.world.scenario.labels)
     speed, delta_v = (f"{value:.1f}" for value in (crash["impact_speed"], max(crash["delta_v"])))
-    return say("crash", who=who, whom=whom, speed=speed, delta_v=delta_v)
+    return say("crash", contact=contact, speed=speed, delta_v=delta_v)
 
 
 def _write_row(name: str, text: str) -> str:
@@ -382,12 +403,11 @@ def _list_other_bases(report: Report) -> Iterator[Row]:
     """Yield p under the other bases that the question names, or why the simulations do not give it."""
     for base, found in report.other_bases.items():
         if isinstance(found, str):
-            yield f"under {base}", f"not known: {found}"
-            yield "", f"--base {base} simulates there; a larger --max-sim gives more failing points"
+            yield f"with {base}", f"not known: {found}"
+            yield "", f"simulate with --base {base}, or raise --max-sim for more failing points"
         else:
-            low, high = found.interval
-            ends = f"{found.p:.3e} ({low:.1e} to {high:.1e})"
-            yield f"under {base}", f"{ends}, {found.ess:.0f} effective failing points"
+            p, low, high = format_alike(found.p, *found.interval)
+            yield f"with {base}", f"{p} ({low} to {high}), {found.ess:.0f} effective failing points"
 
 
 def _list_all_rates(report: Report) -> Iterator[Row]:
@@ -420,7 +440,7 @@ def _list_faults(report: Report) -> Iterator[Row]:
         yield "observations", f"normalised by {report.vec_normalize}"
     if report.faults:
         first = report.faults[0].reason
-        yield "faults", f"the ego failed twice on {len(report.faults)} scenarios; the first: {first}"
+        yield "faults", f"the ego gave no answer in {len(report.faults)} scenarios (asked twice); the first: {first}"
         yield "", f"{report.n_retried:,} more simulations were made to find them"
 
 
@@ -430,8 +450,8 @@ def _describe_failure(report: Report) -> Iterator[str]:
     if not len(failures):
         return
     k = _find_likeliest(failures)
-    f = "the ego failed" if math.isnan(failures.f[k]) else f"f = {failures.f[k]:.3g}"
-    yield f"most likely of {failures.total:,} failures found ({f}; in brackets the central 90 % of ordinary scenarios):"
+    f = "the ego gave no answer" if math.isnan(failures.f[k]) else f"f = {failures.f[k]:.3g}"
+    yield f"most likely of {failures.total:,} failures found ({f}; in parentheses: central 90 % of ordinary scenarios):"
     crash = report.crashes[k]
     if crash is not None:
         yield f"  {_describe_end(report, k)}, serious injury {100 * max(crash['injury_risk']):.2g} %"
@@ -444,16 +464,19 @@ def _list_unusual(space: ScenarioSpace, x: FloatArray) -> str:
     low, high = find_ordinary_range(draw_ordinary(space))
     beyond = np.maximum(low - x, x - high) / np.maximum(high - low, 1e-12)
     shown = [j for j in np.argsort(-beyond) if beyond[j] > 0 and columns[j].shown]
-    return ", ".join(
-        say("unusual", name=columns[j].name, unit=columns[j].unit, **_describe_value(x[j], low[j], high[j]))
-        for j in shown[:N_UNUSUAL]
-    )
+    texts = (_describe_unusual(columns[j], x[j], low[j], high[j]) for j in shown)
+    return ", ".join([text for text in texts if text][:N_UNUSUAL])
 
 
-def _describe_value(value: float, low: float, high: float) -> dict[str, str]:
-    """Return a parameter and the ends of what is ordinary, with two digits."""
+def _describe_unusual(column: Column, value: float, low: float, high: float) -> str:
+    """Return a parameter beside what is usual; a decision of a driver in words, or "" if it says nothing."""
+    limit, words = IN_WORDS.get(column.name, (-math.inf, ""))
+    if value < limit or (column.name in IN_WORDS and not column.unit):
+        return words if value < limit else ""
+    name = PLAIN_NAMES.get(column.name, column.name.replace("_", " "))
     known = {"value": value, "low": low, "high": high}
-    return {name: f"{'-' if each < 0 else ''}{format_rate(abs(each))}" for name, each in known.items()}
+    numbers = {key: f"{'-' if each < 0 else ''}{format_rate(abs(each))}" for key, each in known.items()}
+    return say("unusual", name=name, unit=column.unit, **numbers)
 
 
 def _list_parameters(space: ScenarioSpace, x: FloatArray) -> Iterator[str]:
@@ -464,13 +487,13 @@ def _list_parameters(space: ScenarioSpace, x: FloatArray) -> Iterator[str]:
         if size <= MAX_SHOWN:
             (low,), (high,) = find_ordinary_range(usual[name].reshape(-1, 1))  # of all values of a block
             values = " ".join(f"{format_value(value):>8}" for value in own[name].flat)
-            text = f"{values} {unit:<4} [{format_value(low, 1)} to {format_value(high, 1)}]"
+            text = f"{values} {unit:<4} ({format_value(low, 1)} to {format_value(high, 1)})"
         else:
             normal = space.columns(space.to_standard_normal(np.vstack((x, ordinary))))[name]
             distance = np.linalg.norm(normal, axis=1)
             low, high = np.quantile(distance[1:], (0.05, 0.95))
             spread = (own[name][0] - usual[name].mean(axis=0)) / np.maximum(usual[name].std(axis=0), 1e-12)
             furthest = int(np.abs(spread).argmax())
-            text = f"{size:,} values, {distance[0]:.2f} standard deviations from their mean [{low:.1f} to {high:.1f}]"
+            text = f"{size:,} values, {distance[0]:.2f} standard deviations from their mean ({low:.1f} to {high:.1f})"
             text += f", most in {name}[{furthest}], {spread[furthest]:+.1f}"
         yield _write_row(name, text)

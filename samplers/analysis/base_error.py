@@ -4,7 +4,7 @@ With p_b the probability under refit b, s the standard deviation of log p_b and 
 
     p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2,
 
-the upper end raised by the share of p that a search may have missed, as that of the sampling interval is
+the upper limit raised by the share of p that a search may have missed, as that of the sampling interval is
 (`samplers.sample`): S does not hold it, since the refits miss what the run misses. It is nowhere
 narrower than the sampling interval, which of few draws is wider than their c.o.v. says.
 
@@ -52,6 +52,7 @@ from samplers.analysis.weighted import (
     simultaneous_level,
 )
 from samplers.method import EstimateData
+from samplers.output import format_alike, say
 from samplers.problem import FloatArray
 from samplers.sample import Interval
 
@@ -85,7 +86,7 @@ class BaseUncertainty(Reported):
     """Under the base distribution itself."""
     interval: Interval | None
     """Interval that should hold the value of the true distribution with probability `confidence`, if that is of the
-    fitted family; None where the events do not determine it, or it is not known under the refits."""
+    fitted family; None if the events do not determine it, or it is not known under the refits."""
     expected: float | None = None
     """Probability that the next event fails, the error of the fit averaged: p exp(s^2 / 2) with s the standard
     deviation of log p over the refits; over several families of refits the sum of such means, by their shares. None for
@@ -93,7 +94,7 @@ class BaseUncertainty(Reported):
     spread: float
     """Standard deviation of the value's logarithm over the refits; NaN where it is not known."""
     bound: float | None = None
-    """Upper end of p in place of an interval, where the events do not determine it (a spread above 2)."""
+    """Upper limit of p in place of an interval, if the events do not determine it (a spread above 2)."""
     confidence: float
     """Nominal coverage of `interval`."""
     value_refits: tuple[float, ...]
@@ -108,7 +109,7 @@ class BaseUncertainty(Reported):
     family: str
     """The family of distributions in words."""
     n_sim: int = 0
-    """Simulations of further runs under the mixture of the refits; 0 where none was needed."""
+    """Simulations of further runs under the mixture of the refits; 0 if none was needed."""
     reason: str = ""
     """Why there is no interval, or the value under the refits is not known; empty if there is nothing to say."""
     warnings: tuple[str, ...] = ()
@@ -123,8 +124,8 @@ class BaseUncertainty(Reported):
             first = f"{100 * self.confidence:g} %  {low} to {high} {behind}"
             first += "" if self.expected is None else f"; predictive mean {self.expected:.0e}"
         elif self.bound is not None:
-            below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
-            first = f" the events do not determine p; {below} {behind}"
+            what = f"a lower limit; below {format_alike(self.bound)[0]}" if self.bound < 1 else "limits"
+            first = f" {say('too few events', what=what)} in this family {behind}"
         else:
             return f"base distribution  no interval: {self.reason}"
         lines = [
@@ -132,15 +133,15 @@ class BaseUncertainty(Reported):
             f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
         ]
         if self.n_sim:
-            lines.append(f"  refits from a further {self.n_sim:,} simulations under their mixture")
+            lines.append(f"  with {self.n_sim:,} more simulations from the mixture of the refits")
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
 
 def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
-    """Return the uncertainty of p that the events leave, or None where the base distribution has no refits.
+    """Return the uncertainty of p that the events leave, or None if the base distribution has no refits.
 
-    p under each refit comes from the failing points of the run; where there is a further run under the mixture of the
-    refits, from those of the two that are worth more effective points under that refit. The lower end is that of the
+    p under each refit comes from the failing points of the run; if there is a further run under the mixture of the
+    refits, from those of the two that are worth more effective points under that refit. The lower limit is that of the
     failures with an outcome where the others only bound p (`on_error="bound"`).
     """
     fitted = find_fitted_base(estimate.base)
@@ -198,7 +199,8 @@ def summarise_refits(
     """Return the uncertainty of p, of another mean over failures or of a ratio from its values under refits.
 
     `largest` is the largest value that a mean can have, in units of which `sums` are; for a ratio, `sums` has the two
-    probabilities. The interval holds that of the sampling, and its upper end what a search of some `lineages` may miss.
+    probabilities. The interval holds that of the sampling, and its upper limit what a search of
+    some `lineages` may miss.
     """
     log_values, ess = sums.log_p[0] + math.log(largest), sums.ess.min(axis=0)
     if is_ratio and not reason:
@@ -217,13 +219,15 @@ def summarise_refits(
         if spread <= MAX_SPREAD:
             interval, expected = (low, high), None if is_ratio else expect_over_families(families, largest)
         elif is_ratio:
-            reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
+            few = say("too few events", what="limits of the ratio")
+            reason = f"{few} (standard deviation of its logarithm {spread:.1f})."
         else:
             bound = high
     with np.errstate(over="ignore"):
         values = np.exp(log_values)
     few = count_uncovered(ess)
-    coarse = [f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse."]
+    about = f"{few} of {len(ess)} refits rest on fewer than 10 effective failing points"
+    coarse = [f"{about}: their interval is imprecise; more simulations (max_sim) help."]
     return BaseUncertainty(
         value=value,
         interval=interval,
@@ -253,7 +257,7 @@ def _explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
 
 
 def _exp(exponent: float) -> float:
-    """Return exp(exponent); inf where that is no float."""
+    """Return exp(exponent); inf if that is no float."""
     return math.exp(exponent) if exponent < math.log(np.finfo(np.float64).max) else math.inf
 
 
@@ -276,10 +280,10 @@ class RefitBand(Reported):
     """
 
     low: FloatArray
-    """Lower ends, shape (k,); 0 where the events do not determine the probability, or too few units exceed the
+    """Lower limits, shape (k,); 0 if the events do not determine the probability, or too few units exceed the
     threshold, and no higher threshold has one."""
     high: FloatArray
-    """Upper ends, shape (k,); where too few units exceed the threshold, that of the next lower one."""
+    """Upper limits, shape (k,); where too few units exceed the threshold, that of the next lower one."""
     spread: FloatArray
     """Standard deviation of log P over the refits, shape (k,); NaN where it is not known."""
     confidence: float

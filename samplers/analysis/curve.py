@@ -55,9 +55,9 @@ class Curve(Kept):
     p: FloatArray
     """Estimated probabilities, shape (k,)."""
     low: FloatArray
-    """Lower end of the band, shape (k,)."""
+    """Lower limit of the band, shape (k,)."""
     high: FloatArray
-    """Upper end of the band, shape (k,)."""
+    """Upper limit of the band, shape (k,)."""
     cov: FloatArray
     """Coefficient of variation of each `p`, shape (k,)."""
     ess: FloatArray
@@ -109,7 +109,7 @@ class Curve(Kept):
 
     @property
     def _is_narrow(self) -> NDArray[np.bool_]:
-        """Where the ends of the band are within `WIDEST_BAND`, shape (k,); everywhere if they are nowhere."""
+        """Whether the band is within `WIDEST_BAND`, shape (k,); all True if it never is."""
         narrow = self.high <= WIDEST_BAND * self.low
         return np.asarray(narrow | ~narrow.any())
 
@@ -135,7 +135,7 @@ register_stored(Curve)
 def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     """Return the curve of an estimate at thresholds; see `Estimate.curve`.
 
-    p is the sum of the weights of the points with f <= g. Where the estimate at gamma is not that sum
+    p is the sum of the weights of the points with f <= g. If the estimate at gamma is not that sum
     (control variates), p is scaled below gamma, and shifted by the difference at gamma above it. Its
     c.o.v. is that of the sum over independent units, times the factor by which the estimate's c.o.v.
     exceeds it at gamma.
@@ -144,9 +144,9 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     of plain draws, else log-normal with the t quantile of the effective units. At that level normal
     deviations with the correlation of the curve stay inside all intervals with probability
     `confidence` (sup-t); it is found from 10,000 draws, whose generator comes from the seed.
-    Where p rests on a search, the upper ends hold the share that it may have missed, as that of the estimate does, and
+    If p rests on a search, the upper limits hold the share that it may have missed, as that of the estimate does, and
     what strata may add of which no point lies below the threshold.
-    Points without an outcome that only bound p ("bound") are not in the lower ends.
+    Points without an outcome that only bound p ("bound") are not in the lower limits.
     The truth rises with g, so the ends of the band are made to rise too, which only narrows it.
 
     The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma

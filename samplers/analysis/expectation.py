@@ -44,7 +44,7 @@ NOWHERE = 1e308
 
 @dataclass(frozen=True, kw_only=True)
 class FailureExpectation(Reported):
-    """E[h(X); failure], the expectation of a quantity h >= 0 that is 0 where nothing fails.
+    """E[h(X); failure], the expectation of a quantity h >= 0 that is 0 if nothing fails.
 
     Example:
         With p = 0.01 and E[h(X) | failure] = 2:
@@ -118,7 +118,7 @@ def expect_under_refits(
             run itself count.
 
     Returns:
-        Its `value` is the expectation; None where the base has no refits.
+        Its `value` is the expectation; None if the base has no refits.
 
     Example:
         h = 2 at every failing point, P[x >= 1] under N(0, 1) and under its refits N(-0.2, 1), N(0, 1) and N(0.2, 1):
@@ -189,7 +189,7 @@ def _sum_parts_under_refits(
 class Exceedance(Curve):
     """P[failure and v(X) > t] at several thresholds t, with a band that should hold all of them at once.
 
-    `low` is 0 where fewer than 5 effective independent units exceed the threshold, and `high` there that of the next
+    `low` is 0 if fewer than 5 effective independent units exceed the threshold, and `high` there that of the next
     lower threshold, which bounds it.
 
     Example:
@@ -206,7 +206,7 @@ class Exceedance(Curve):
     """
 
     base: RefitBand | None = None
-    """Band that the events behind the base distribution allow; None where it has no refits, or these tell
+    """Band that the events behind the base distribution allow; None if it has no refits, or these tell
     nothing of any threshold."""
 
     axis = "thresholds"
@@ -251,12 +251,12 @@ def compute_exceedance(
 ) -> Exceedance:
     """Return P[failure and v > t] over thresholds t, with a simultaneous (sup-t) band as that of `Estimate.curve`.
 
-    Where the base has refits, the curve also has the band that its events allow.
+    If the base has refits, the curve also has the band that its events allow.
 
     Args:
         estimate: The run.
         failures: Its weighted failing points.
-        values: v at these points, shape (k,); -inf where it exceeds no threshold.
+        values: v at these points, shape (k,); -inf if it exceeds no threshold.
         thresholds: Thresholds t, in any order.
         further: Failing points of the run's `ensemble_run`, if it has one, and v at them; they count for the refits
             alone.
@@ -311,9 +311,9 @@ def _band_under_refits(
     thresholds: FloatArray,
     sampling: tuple[FloatArray, FloatArray, FloatArray],
 ) -> RefitBand | None:
-    """Return the band that refits allow for probabilities at k thresholds; None where these tell nothing of any.
+    """Return the band that refits allow for probabilities at k thresholds; None if these tell nothing of any.
 
-    `sampling` has the probabilities (k,), 0 where too few units exceed the threshold, their c.o.v. (k,) and the
+    `sampling` has the probabilities (k,), 0 if too few units exceed the threshold, their c.o.v. (k,) and the
     correlation of their errors (k, k).
     """
     fitted = find_fitted_base(estimate.base)

@@ -1,12 +1,12 @@
 """Gate: whether a probability, or a rate that follows from it, is below a limit, at a one-sided confidence.
 
-An interval with nominal coverage c has each of its ends at the one-sided confidence (1 + c) / 2: the true p is above
-the upper end with probability (1 - c) / 2 at most, and below the lower end likewise. A test at confidence 0.95 takes
-the ends of a 90 % interval. Where nothing failed, the upper end is the bound that the draws from the base give by
-themselves, whatever the method.
+Each limit of an interval with nominal coverage c has the one-sided confidence (1 + c) / 2: the true p is above the
+upper limit with probability (1 - c) / 2 at most, and the same is so of the lower limit. A test at confidence 0.95 takes
+the limits of a 90 % interval. If nothing failed, the upper limit is the bound that the draws from the base give by
+themselves, with any method.
 
 A fixed number of simulations is one look, with the ends of the interval; a run that stopped on what it saw has those
-of its confidence sequence, which hold at all looks. Where the base distribution was fitted, they are the ends that the
+of its confidence sequence, which hold at all looks. If the base distribution was fitted, they are the ends that the
 events behind the base leave (`samplers.analysis.base_error`), moved out by as much, unless it is taken as given.
 
 Warnings that p may be wrong leave it undecided. Those that p is coarse do not: of 53 runs with one on 67 limit states
@@ -47,8 +47,8 @@ Decision = Literal["passes", "fails", "undecided"]
 class Verdict(Reported):
     """Whether P[f(X) <= gamma], or a rate, is below a limit.
 
-    It passes if the upper end is below the limit, fails if the lower end is above it, and is undecided otherwise, or
-    where a warning says that p may be wrong. It is true where it passes.
+    It passes if the interval lies below the limit and fails if it lies above. It is undecided otherwise, or if a
+    warning says that p may be wrong. It is true if it passes.
 
     Example:
         >>> import samplers
@@ -65,9 +65,9 @@ class Verdict(Reported):
     confidence: float
     """One-sided confidence of each end."""
     low: float
-    """One-sided lower end; 0 where it is not known."""
+    """One-sided lower limit; 0 if it is not known."""
     high: float
-    """One-sided upper end; 1 where that of p is not known."""
+    """One-sided upper limit; 1 if that of p is not known."""
     includes_base: bool
     """Whether the ends hold the uncertainty of the base distribution."""
     reason: str = ""
@@ -75,7 +75,7 @@ class Verdict(Reported):
     quantity: str = "p"
     """What is below the limit or not."""
     if_exact: Decision | None = None
-    """The decision if the base distribution were the true one; None where the ends do not hold its uncertainty."""
+    """The decision if the base distribution were the true one; None if the ends do not hold its uncertainty."""
 
     def __bool__(self) -> bool:
         """Return whether it passes."""
@@ -89,17 +89,17 @@ class Verdict(Reported):
         return f"{self.decision}: {self.describe_ends()}{why}"
 
     def describe_ends(self) -> str:
-        """Return where the ends lie, in words."""
+        """Return the limits of p, or of the rate, in words."""
         low, high = format_alike(self.low, self.high)
         sure = f"{100 * self.confidence:.4g} %"
         return say(self.decision, what=self.quantity, limit=f"{self.limit:g}", sure=sure, low=low, high=high)
 
     @property
     def cause(self) -> str:
-        """Why it is undecided, and what would decide it; empty where it is decided."""
+        """Why it is undecided, and what would decide it; empty if it is decided."""
         if self.decision != "undecided":
             return ""
-        return self.reason or say("too few events" if self.if_exact in ("passes", "fails") else "too few simulations")
+        return self.reason or say("more events" if self.if_exact in ("passes", "fails") else "more simulations")
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -122,7 +122,7 @@ def find_ends(estimate: EstimateData, base: BaseUncertainty | None) -> Interval:
 
 
 def find_doubt(warnings: Sequence[str]) -> str:
-    """Return the first warning that says that p may be wrong, as a reason; empty where there is none."""
+    """Return the first warning that says that p may be wrong, as a reason; empty if there is none."""
     doubts = [text.rstrip(".") for text in warnings if COARSE not in text]
     return f"a warning says that p may be wrong: {doubts[0]}" if doubts else ""
 
@@ -147,8 +147,8 @@ def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty |
     if base is not None:
         ends = base.interval or (0.0, 1.0 if base.bound is None else base.bound)
         if base.interval is None and base.bound is None:
-            reason = f"p under the refits of the base distribution is not known: {base.reason.rstrip('.')}"
-            reason = reason if base.value else "without a failure the error of the base distribution is not known"
+            why = f": {base.reason.rstrip('.')}" if base.value else " before a failure is found"
+            reason = f"the error of the base distribution is not known{why}"
     doubts = (*(() if none_failed else estimate.warnings), *(() if base is None else base.warnings))
     ends, reason = widen_ends(estimate, ends), find_doubt(doubts) or reason
     if_exact = None if base is None else judge_estimate(estimate, max_p, None).decision
@@ -173,8 +173,8 @@ class Pilot:
         >>> Pilot(method="mc", p=1e-3, cov=0.9, n_sim=1200, final_draws=1200)
         Traceback (most recent call last):
             ...
-        ValueError: The pilot of 1,200 simulations has a c.o.v. of 0.9: above 0.5 it tells too little; a plan needs a larger one.
-    """  # noqa: E501 (the example shows a whole message)
+        ValueError: The pilot of 1,200 simulations has a relative error of 0.9, above 0.5: simulate more for a plan.
+    """
 
     method: str
     """Name of its method."""
@@ -194,11 +194,11 @@ class Pilot:
     def __post_init__(self) -> None:
         """Check that there is something to plan from."""
         if not self.p > 0.0:
-            raise ValueError(f"The pilot of {self.n_sim:,} simulations found no failure: a plan needs a larger one.")
+            raise ValueError(f"The pilot of {self.n_sim:,} simulations found no failure: simulate more for a plan.")
         if not 0.0 < self.cov <= MAX_PILOT_COV:
             raise ValueError(
-                f"The pilot of {self.n_sim:,} simulations has a c.o.v. of {self.cov:.2g}: above {MAX_PILOT_COV} it "
-                "tells too little; a plan needs a larger one."
+                f"The pilot of {self.n_sim:,} simulations has a relative error of {self.cov:.2g}, above "
+                f"{MAX_PILOT_COV}: simulate more for a plan."
             )
 
 
@@ -214,7 +214,7 @@ class PlannedRun(Reported):
     method: str
     """Name of the method."""
     target_cov: float
-    """Coefficient of variation that is wished for: `target_cov` of `estimate`."""
+    """Target coefficient of variation: `target_cov` of `estimate`."""
     n_sim: int
     """Simulations, those of a search included."""
     seconds: float | None = None
@@ -226,7 +226,7 @@ def plan(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
 
     Args:
         pilot: The pilot.
-        target_cov: Coefficient of variation that is wished for.
+        target_cov: Target coefficient of variation.
 
     Raises:
         ValueError: If the target is not above 0.

@@ -6,7 +6,7 @@ spread that p owes to the events.
 
 Refits may choose the family of distributions anew, and those of one family spread around a value of their own. One
 standard deviation over all would take the distance between two families for a spread to both sides: where some refits
-lie far below p, the upper end would rise as well. So each family has an interval around its own centre, and the whole
+lie far below p, the upper limit would rise as well. So each family has an interval around its own centre, and the whole
 reaches from the lowest end to the highest; what is expected for the next event is the sum of what each family expects,
 by its share of the refits.
 """
@@ -34,6 +34,7 @@ from samplers.analysis.weighted import (
 )
 from samplers.bases import as_distribution, convert
 from samplers.method import EstimateData
+from samplers.output import format_alike
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Interval, Sample, add_unseen, effective_number, raise_log_end
 
@@ -127,10 +128,10 @@ class Reweighted(Reported):
 
     def __str__(self) -> str:
         """Return two lines for people."""
-        low, high = self.interval
+        p, low, high = format_alike(self.p, *self.interval)
         return (
-            f"P[f <= {self.gamma:g}] = {self.p:.3e} under the new base, {self.ratio:.3g} times that under the old\n"
-            f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {self.cov:.3g}; "
+            f"P[f <= {self.gamma:g}] = {p} with the new base, {self.ratio:.2g} times that with the old\n"
+            f"  {100 * self.confidence:g} % interval {low} to {high}, c.o.v. {self.cov:.2g}; "
             f"effective sample size {self.ess:.0f} failing points, {self.units:.0f} independent units"
         )
 
@@ -141,9 +142,9 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
     variance is sum T_c^2 - p1^2 / n, to which the largest T_c^2 is added: where one term dominates, the
     sample variance is too small most of the time. The interval is log-normal with the t
-    quantile of the effective units. Where p rests on a search, the upper end holds the share that it may have missed,
+    quantile of the effective units. If p rests on a search, the upper limit holds the share that it may have missed,
     as that of the estimate does; its lineages count for less as the effective units become fewer. A stratum without a
-    failing point keeps its upper end, with its share in the new base where that has one of the same name.
+    failing point keeps its upper limit, with its share in the new base where that has one of the same name.
     """
     sample = require_sample(estimate)
     if isinstance(new_base, str):
@@ -271,7 +272,7 @@ class RefitSums(NamedTuple):
     """Sums over the failing points under R refits, for m parts of p."""
 
     log_p: FloatArray
-    """Logarithm of the probability, shape (m, R); -inf where a refit has no density at any failing point."""
+    """Logarithm of the probability, shape (m, R); -inf if a refit has no density at any failing point."""
     ess: FloatArray
     """Effective number of failing points behind it, shape (m, R); a path of a Markov chain counts as one."""
 
@@ -392,13 +393,13 @@ def choose_better_run(found: Sequence[RefitSums], points: Sequence[FloatArray] |
 
 
 def count_uncovered(ess: FloatArray) -> int:
-    """Return how many of R refits rest on too few effective failing points, ess (R,); 0 where no more than a tenth."""
+    """Return how many of R refits rest on too few effective failing points, ess (R,); 0 if no more than a tenth."""
     few = int(np.count_nonzero(ess < MIN_REFIT_ESS))
     return few if few > MAX_UNCOVERED_SHARE * len(ess) else 0
 
 
 def pool_refits(base: Any) -> Distribution:
-    """Return the mixture of refits that a further run simulates under; a ValueError where the base cannot mix them."""
+    """Return the mixture of refits that a further run simulates under; a ValueError if the base cannot mix them."""
     mix = base.covering_ensemble if hasattr(base, "covering_ensemble") else base.ensemble
     mixture: Distribution = mix()
     return mixture
@@ -408,7 +409,7 @@ def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], Flo
     """Return whether a further run under the mixture of the refits would tell p, or a part of it, under them.
 
     It would where more than a tenth of the refits rest on under 10 effective failing points, or one of them on none.
-    False where the base has no refits or no `ensemble`, or where the run, or a part of it, has few effective failing
+    False if the base has no refits or no `ensemble`, or if the run, or a part of it, has few effective failing
     points under its own base: another of that size would have as few.
     """
     fitted, sample = find_fitted_base(estimate.base), estimate.sample
@@ -430,15 +431,15 @@ class RefitFamily(NamedTuple):
     centre: float
     """Of log p: that of the base distribution itself in its own family, the mean of the refits in another."""
     variance: float
-    """Of log p over its refits; pooled over all families where it has few."""
+    """Of log p over its refits; pooled over all families if it has few."""
     freedom: int
     """Degrees of freedom of `variance`: its refits less 1; of the pooled one all refits less the number of families."""
     share: float
-    """Of the refits that are of this family; 0 for that of the base where no refit chose it."""
+    """Of the refits that are of this family; 0 for that of the base if no refit chose it."""
 
 
 def read_refit_families(fitted: object, n_refits: int) -> NDArray[np.int64]:
-    """Return the family of each refit, shape (n_refits,); all 0 where the base knows none, or each has one member.
+    """Return the family of each refit, shape (n_refits,); all 0 if the base knows none, or each has one member.
 
     Nothing tells a spread within a family from one between them where each has one member.
     """
@@ -475,7 +476,7 @@ def find_log_ends(
     """Return the lowest and the highest end of log p over the families.
 
     Each has the interval centre -+ t S; S^2 is its variance plus `other_variance`, t the quantile for its degrees of
-    freedom. The upper end holds the share of p in regions of failure that a search may have missed, which is missing
+    freedom. The upper limit holds the share of p in regions of failure that a search may have missed, which is missing
     under all refits alike. Families that hardly any refits choose are left out, but not that of the base.
     """
     ends = []

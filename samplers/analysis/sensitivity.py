@@ -114,7 +114,7 @@ class ParameterSensitivity:
     """Standard error of `d_log_p`."""
     share: float | None = None
     """Share of the spread of log p over the refits, to first order; all add up to 1, and one may be negative where
-    parameters vary together. None where the base has no refits with the same parameters."""
+    parameters vary together. None if the base has no refits with the same parameters."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -145,7 +145,7 @@ class Sensitivity(Reported):
     small p and a smooth limit state."""
     shares: Mapping[str, float] = field(default_factory=dict)
     """Share of the spread of log p over the refits by parameter of x, the largest first; a correlation counts half for
-    each of the two. Empty where the base has no refits."""
+    each of the two. Empty if the base has no refits."""
     spread: float | None = None
     """Standard deviation of log p over the refits used."""
     first_order_spread: float | None = None
@@ -171,9 +171,7 @@ class Sensitivity(Reported):
             for each in self.columns[:SHOWN_PARAMETERS]
         ]
         if self.points < ENOUGH_POINTS:
-            lines.append(
-                f"from only {self.points:.0f} effective failing points: importance and derivatives are not determined"
-            )
+            lines.append(f"only {self.points:.0f} effective failing points, too few for importance and derivatives")
         if shown:
             lines.append(f"{head:<{width}} {'change':>8} {'d log p':>9}    error" + ("   share" if self.shares else ""))
         for each in shown:

@@ -68,7 +68,7 @@ def require_sample(estimate: EstimateData) -> Sample:
 
 
 def cov_inflation(estimate: Outcome, own_cov: float) -> float:
-    """Return the factor max(1, c.o.v. of the estimate / c.o.v. of its units at gamma); 1 where either is not known."""
+    """Return the factor max(1, c.o.v. of the estimate / c.o.v. of its units at gamma); 1 if either is not known."""
     if not math.isfinite(estimate.cov) or not 0 < own_cov < math.inf:
         return 1.0
     return max(1.0, estimate.cov / own_cov)
@@ -77,11 +77,11 @@ def cov_inflation(estimate: Outcome, own_cov: float) -> float:
 def add_unresolved(
     estimate: EstimateData, thresholds: FloatArray, p: FloatArray, high: FloatArray, new_base: Any = None
 ) -> FloatArray:
-    """Return upper ends (G,) of p (G,) at thresholds g (G,) with what strata may add that are not resolved there.
+    """Return upper limits (G,) of p (G,) at thresholds g (G,) with what strata may add that are not resolved there.
 
     These are all that are not at gamma, and those of which no point has f <= g. They may add the root of the sum of
-    (w_k h_k)^2, h_k the upper end of their p_k, as in the interval of the sum. A new base with strata of the same names
-    has its own w_k.
+    (w_k h_k)^2, h_k the upper limit of their p_k, as in the interval of the sum. A new base with strata of the same
+    names has its own w_k.
     """
     if not estimate.parts:
         return high
@@ -105,8 +105,8 @@ def find_missed(
 ) -> tuple[float, list[str]]:
     """Return how much strata may add to a kind of failure that they hardly showed, and their names; 0 without strata.
 
-    That is the root of the sum of (w_k h_k s_k)^2, h_k the upper end of p_k, s_k the bound of a share that none of the
-    effective failing draws of the stratum had (1 where p_k is not resolved).
+    That is the root of the sum of (w_k h_k s_k)^2, h_k the upper limit of p_k, s_k the bound of a share that none of
+    the effective failing draws of the stratum had (1 if p_k is not resolved).
 
     Args:
         parts: Of the estimate.
@@ -146,7 +146,7 @@ class UnitSums:
 
     @property
     def cov(self) -> FloatArray:
-        """Coefficient of variation of `p`, shape (G,); inf where p = 0."""
+        """Coefficient of variation of `p`, shape (G,); inf if p = 0."""
         square = self.p**2  # may underflow
         relative = np.divide(np.diag(self.second), square, out=np.full(len(self.p), np.inf), where=square > 0)
         return np.asarray(np.sqrt(np.maximum(relative - 1 / self.n_units, 0.0)))
@@ -211,7 +211,7 @@ def leave_out_lost(sample: Sample) -> Sample:
 
 
 def estimate_known(found: Outcome, gamma: float, confidence: float) -> tuple[float, float, float]:
-    """Return p > 0 of the failures that have an outcome, its c.o.v. and the lower end, from these points alone.
+    """Return p > 0 of the failures that have an outcome, its c.o.v. and the lower limit, from these points alone.
 
     Without weighted points they are p in proportion, which is then as if that share of 1 / cov^2 failures were met.
     """
@@ -290,7 +290,7 @@ class WeightedFailures:
     rows: NDArray[np.int64]
     """Their rows among all failing points, `Sample.x`, shape (k,)."""
     has_outcome: NDArray[np.bool_]
-    """Where f gave a value; elsewhere the point counts as failing because f raised or gave NaN, shape (k,)."""
+    """Whether f gave a value, shape (k,); if not, f raised or gave NaN and the point counts as failing."""
     weights: FloatArray
     """Weights scaled so that they add up to the estimate's p, shape (k,)."""
     units: NDArray[np.int64]
@@ -328,7 +328,7 @@ class WeightedFailures:
         return value, cov, (low * largest, self.add_missed(terms, high * largest, confidence, largest))
 
     def add_missed(self, terms: FloatArray, high: float, confidence: float, largest: float = 1.0) -> float:
-        """Return the upper end of the sum of terms (k,), `high`, with what strata that hardly showed it may add."""
+        """Return the upper limit of the sum of terms (k,), `high`, with what strata that hardly showed it may add."""
         missed, value = largest * find_missed(self.parts, self.units, self.weights, terms, confidence)[0], terms.sum()
         return min(largest, float(value + np.hypot(high - value, missed))) if missed > 0 else high
 
@@ -344,7 +344,7 @@ class WeightedFailures:
 
 
 def choose_failures(sample: Sample, gamma: float, most: int | None = None) -> NDArray[np.int64]:
-    """Return rows of `Sample.x`: all of them, or `most` evenly spaced ones where there are more.
+    """Return rows of `Sample.x`: all of them, or `most` evenly spaced ones if there are more.
 
     Raises:
         ValueError: If `most` is not positive.

@@ -55,20 +55,20 @@ LONG = 30
 ENOUGH = 1000
 """Simulations from which `Series` has room for walks, rounds and an estimate."""
 SLOW = 1.0
-"""Seconds of a simulation from which on 6,000 of them are taken as too many where max_sim does not say: 100 minutes."""
+"""Seconds of a simulation from which on 6,000 of them are taken as too many if max_sim does not say: 100 minutes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Auto(Method):
     """Choice among the methods by budget, dimension and what f does; the default of `estimate`.
 
-    1. *Terms.* `Series` where the problem offers terms and their gradients, with 30 coordinates or more and 1,000
+    1. *Terms.* `Series` if the problem offers terms and their gradients, with 30 coordinates or more and 1,000
        simulations or more.
     2. *Up to 1,000 simulations* a run begins as `Surrogate`. Its batches are predicted before they are simulated:
 
        - In up to 20 dimensions it ends so, unless 600 simulations are left when 200 were spent and the failures of two
          batches were never foreseen (f jumps, or fails in many regions): `TwoStage` has the rest.
-       - In more it ends so where kriging explains 40 % of the variance of f from 100 base draws (a third of the run, if
+       - In more it ends so if kriging explains 40 % of the variance of f from 100 base draws (a third of the run, if
          that is less), each that is safe predicted from the others. Else `AdaptiveSubsetSimulation` goes on from these.
 
        More simulations are for `TwoStage`, but up to 2,000 in more than 20 dimensions for `AdaptiveSubsetSimulation`.
@@ -105,7 +105,7 @@ class Auto(Method):
             check_settings(self, seconds_per_simulation=(0.0, math.inf))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
-        """Learn f where there are few simulations, and go on by the method that suits it."""
+        """Learn f if there are few simulations, and go on by the method that suits it."""
         slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
         budget = (FEW if slow else TwoStage().n) if goal.max_sim is None else goal.max_sim
         noise, offer = noise_mask(inputs), offer_of(inputs)

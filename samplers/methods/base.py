@@ -82,13 +82,13 @@ class Method(Stepping, Protocol):
 
 
 def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:
-    """Return which coordinates of x are noise, shape (d,): none where the base distribution does not say."""
+    """Return which coordinates of x are noise, shape (d,): none if the base distribution does not say."""
     noise = getattr(inputs.base, "noise", None)  # a user's distribution need not have it
     return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
 
 
 def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
-    """Return the inputs to search: these themselves where none of them is noise, or all are."""
+    """Return the inputs to search: these themselves if none of them is noise, or all are."""
     noise = noise_mask(inputs)
     return inputs if not noise.any() or noise.all() else cast(Inputs, NoiseMarginalisedInputs(inputs, noise, rng))
 

@@ -36,7 +36,7 @@ class CrossEntropy(Method):
     that announces its own (`base.blocks`; `Product` is one): Beta in a
     box, Normal with fixed covariance and its mean in a box, Gaussian, mixture.
 
-    Where the paper, its released code and this implementation differ:
+    Differences between the paper, its released code and this implementation:
 
     - *gamma_k* >= gamma, as the text says; the algorithm box has "minimum of gamma and the quantile".
     - *Equation 3* divides by N_k, the code by N rho; we divide by the sum of the weights, so that Q_k has mass 1.
@@ -57,7 +57,7 @@ class CrossEntropy(Method):
     Normal of d dimensions is learned from m effective elite points up to a shift of about
     sqrt(d / m) standard deviations, which is what a small radius guards against.
 
-    The interval is log-normal; where the base draws already fail with a share of rho or more,
+    The interval is log-normal; if the base draws already fail with a share of rho or more,
     plain Monte Carlo draws and Clopper-Pearson take over. A run that is stopped before its final
     draws gives the estimate of the base draws and the last proposal's, taken as one sample.
 

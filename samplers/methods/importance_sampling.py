@@ -44,7 +44,7 @@ class ImportanceSampling(Method):
       c.o.v. holds the largest weight in addition, so that a lucky early batch does not stop it.
     - *Cost.* The search is part of n_sim.
 
-    One shift serves one region. Where more than 5 % of the points under the first level lie behind the
+    One shift serves one region. If more than 5 % of the points under the first level lie behind the
     origin as the tilt sees it, or more than 5 % of the failing ones found lie where the tilted density is
     under the base density, the tilt is given up for base draws, with a warning: other regions would
     otherwise carry weights of 1 / base_share at best, or not be seen before the stop. Tian et al. blame
@@ -53,7 +53,7 @@ class ImportanceSampling(Method):
 
     Args:
         half_width: Relative half-width of the 95 % interval to stop at; goal.target_cov goes first.
-        n: Final draws at most where max_sim does not say.
+        n: Final draws at most if max_sim does not say.
         batch: Final draws per call of f.
         n_round: Draws per round of the search; at most a tenth of max_sim. (The script has 200.)
         max_rounds: Rounds of the search at most. (The script has 10.)
@@ -94,7 +94,7 @@ class ImportanceSampling(Method):
 
     @property
     def own_target(self) -> float:
-        """Coefficient of variation to stop at where the goal has none."""
+        """Coefficient of variation to stop at if the goal has none."""
         return self.half_width / QUANTILE
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
@@ -116,10 +116,10 @@ class ImportanceSampling(Method):
             outcome = replace(outcome, status=Status.CONVERGED if met else Status.BUDGET)
         if met or goal.target_cov is not None:  # `Run` tells of a goal's target
             return outcome
-        return outcome.remark_first(f"All draws were used at a c.o.v. of {outcome.cov:.3g}, above {target:.3g}.")
+        return outcome.remark_first(f"All draws were used: relative error {outcome.cov:.3g}, above {target:.3g}.")
 
     def _search(self, search: Search, dim: int) -> Generator[FloatArray, FloatArray, Gaussian | None]:
-        """Follow the level down to gamma and fit the shift there twice; None where base draws serve."""
+        """Follow the level down to gamma and fit the shift there twice; None if base draws serve."""
         tilt, gamma, reached, identity = None, search.goal.gamma, 0, np.eye(dim)
         proposal: ProposalDistribution = search.base
         while last := (yield from search.draw(proposal, self.n_round, self.max_rounds)):

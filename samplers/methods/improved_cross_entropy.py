@@ -45,7 +45,7 @@ class ImprovedCrossEntropy(Method):
     Where the authors' released code (the ERA group's iCE scripts) and this implementation differ:
 
     - *Estimate.* The code estimates from the last draws of the search, whose proposal was stopped by looking at them.
-      Fresh draws, base draws among them, are right whatever the search did; their proposal is fitted to the failures of
+      Fresh draws, base draws among them, are right with any search; their proposal is fitted to the failures of
       all rounds, as the last round may have lost a region.
     - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off as fast as they do or faster.
     - *sigma* is sought by bisection between 1e-15 and 10 times the median of |f - gamma|; the code's first width,
@@ -55,7 +55,7 @@ class ImprovedCrossEntropy(Method):
       dimensions can be had.
 
     A region that the search did not see or lost in fitting is seen by base draws only, as a rare heavy
-    weight (then warned of) or not at all. The interval is log-normal (`weighted_interval`); where the base draws
+    weight (then warned of) or not at all. The interval is log-normal (`weighted_interval`); if the base draws
     themselves fail often enough, plain draws and Clopper-Pearson take over.
 
     Args:
@@ -109,7 +109,7 @@ class ImprovedCrossEntropy(Method):
         return (yield from search.finish(sampler, self.n_final, search.warnings()))
 
     def _search(self, search: Search) -> Generator[FloatArray, FloatArray, Mixture | None]:
-        """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""
+        """Narrow the target down to failure; return the proposal fitted last, None if base draws serve."""
         gamma, rng = search.goal.gamma, search.rng
         sampler: ProposalDistribution = search.base
         proposal: Mixture | None = None
@@ -156,7 +156,7 @@ def log_smooth_indicator(g: FloatArray, width: float) -> FloatArray:
 
 
 def weights_cov(log_weights: FloatArray) -> float:
-    """Return the c.o.v. of weights given as logarithms (n,); inf where all are 0."""
+    """Return the c.o.v. of weights given as logarithms (n,); inf if all are 0."""
     highest = float(log_weights.max())
     if highest == -math.inf:
         return math.inf

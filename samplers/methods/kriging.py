@@ -3,7 +3,7 @@
 Made robust against what simulators return:
 
 - *Scale.* Outcomes y = f - gamma are compressed, z = arcsinh(y / c): what is far from gamma matters little.
-- *Caps.* Where many outcomes equal the largest (a capped time to collision) or the least one (-1 on collision), they
+- *Caps.* If many outcomes equal the largest (a capped time to collision) or the least one (-1 on collision), they
   are censored: known to be at least the cap, or at most 0, and replaced within these bounds by what the others predict
   there, then by their leave-one-out predictions.
 - *A jump to failure* (0.5 s, then a collision) moves the limit to where points begin to fail.

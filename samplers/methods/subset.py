@@ -112,7 +112,7 @@ ACCEPTANCE_RANGE = (0.15, 0.85)
 def summarise(inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Level], status: Status) -> Outcome:
     """Return the outcome of all levels, of the last of which `trace` counts f <= gamma.
 
-    The upper end is at most that of the base draws of level 0 alone.
+    The upper limit is at most that of the base draws of level 0 alone.
     """
     hits, p = levels[-1].where(levels[-1].f <= goal.gamma).f, trace[-1].estimate
     cov, (low, high) = judge_levels(levels[-1], goal, trace)
@@ -190,7 +190,7 @@ class SubsetSimulation(SubsetMethod):
     keeps each with probability min(1, phi(new) / phi(old)), and is taken if it ends in F_j. Works
     in standard normal space.
 
-    Where the paper and this implementation differ:
+    Differences between the paper and this implementation:
 
     - *Chains* move together, one step per call of f, so that f gets about p0 N rows per call.
     - *A candidate equal to its point* (every third or so in one dimension) is not simulated again.
@@ -248,7 +248,7 @@ class AdaptiveSubsetSimulation(SubsetMethod):
     level 1 on, every point inside F_j starts a Markov chain that stays in F_j. Works in standard
     normal space.
 
-    Where the paper, its released code and this implementation differ:
+    Differences between the paper, its released code and this implementation:
 
     - *Proposal.* "conditional" is the code's, u' = rho u + sigma xi, which needs no ratio; the paper prints a ratio
       with it, phi(new) / phi(old) per component, which makes the invariant distribution N(0, 1/2). "metropolis" is that

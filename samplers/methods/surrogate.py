@@ -57,7 +57,7 @@ LEAST_ESS = 10.0  # Effective failing draws below which the upper end is Bernste
 LEAST_SKILL = 0.4
 """Share of the variance of f that is to be predicted of points left out, in many dimensions: with 100 base draws it is
 0.41 to 0.95 where one or two planes or a sum of claims fail, 0.28 for four planes, up to 0.13 for a ring or a first
-passage, where nothing is to be learned from a few hundred simulations."""
+passage, if nothing is to be learned from a few hundred simulations."""
 LEAST_LEFT = 600  # Simulations that another method is to have if it takes over where f is not learned
 
 
@@ -150,7 +150,7 @@ def choose_batch(pool: Pool, n: int, rng: np.random.Generator) -> FloatArray:
 class SurrogateRun:
     """One run, with what has been simulated so far.
 
-    Where `may_leave`, the run gives up when f is not learned and another method would do better with the rest: `steps`
+    If `may_leave`, the run gives up when f is not learned and another method would do better with the rest: `steps`
     then returns None.
     """
 
@@ -353,7 +353,7 @@ class Surrogate(Method):
        of 20,000 draws that are not simulated.
 
     *Interval.* Log-normal with t quantiles; where under 10 effective draws failed the lesser of Bernstein's bound and
-    that of the base draws. The upper end also holds what no draw can have met (`two_stage/regions.py`, a batch of
+    that of the base draws. The upper limit also holds what no draw can have met (`two_stage/regions.py`, a batch of
     learning with failures as a lineage). With a few hundred simulations that is a large part of it.
 
     *Noise.* Coordinates that the base distribution calls noise are drawn, not learned; kriging takes what they do to f,

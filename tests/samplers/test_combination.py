@@ -73,7 +73,7 @@ def test_pooled_counts_weigh_draws_not_runs():
     assert result.interval == clopper_pearson(4, 1000, 0.95)
     assert result.no_outcome_share == 1 / 4
     assert combined_cov([few, many]) == result.cov == binomial_cov(0.004, 1000)
-    assert result.warnings == ("Only 4 of 1,000 simulations failed; the estimate is coarse.",)
+    assert result.warnings == ("Only 4 of 1,000 simulations failed; the estimate is imprecise.",)
     assert combine([few, replace(many, counts=None)], 0.95).p == pytest.approx((1 / 100 + 3 / 900) / 2)
 
 

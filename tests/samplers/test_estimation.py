@@ -168,4 +168,4 @@ def test_what_cannot_search_under_a_mixture_is_left_to_two_stage_and_refits_that
     assert len(result.base_uncertainty.value_refits) == 30
     result = samplers.estimate(HalfSpace(fitted(FAR_REFITS, Unmixed), 2.0), "mc", seed=1, max_sim=2000)
     assert result.ensemble_run is None and result.p > 0
-    assert "30 of 30 refits rest on under 10" in result.base_uncertainty.warnings[0]
+    assert "30 of 30 refits rest on fewer than 10" in result.base_uncertainty.warnings[0]

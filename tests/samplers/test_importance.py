@@ -92,12 +92,12 @@ def test_one_heavy_draw_does_not_lift_the_lower_end_above_what_the_others_say():
 
 
 def test_doubts_are_of_few_and_of_heavy_draws():
-    assert "draws: 9;" in weight_warnings(equal(9))[0]
+    assert "size of 9;" in weight_warnings(equal(9))[0]
     assert weight_warnings(equal(10)) == []
     others = [1.0] * 100
     assert weight_warnings(weighing(*others, 44.0)) == []  # 144^2 / 2036 = 10.2
     assert weight_warnings(weighing(*others, 50.0)) == [  # 150^2 / 2600
-        "Effective sample size of the failing draws: 9; the estimate is coarse."
+        "The failing draws have an effective sample size of 9; the estimate is imprecise."
     ]
     assert "None of 1,000 final draws failed" in weight_warnings(weighing())[0]
 

@@ -52,7 +52,7 @@ def test_says_how_large_a_region_may_have_been_missed():
     estimate = estimate_adss()
     assert estimate.base_draws == 1000
     assert (1 - estimate.unseen) ** 1000 == pytest.approx(0.05)
-    said = "a failure region that no draw met: below 3.0e-03 (1,000 base draws, 95 % confidence)"
+    said = "a failure region that the search missed: below 3.0e-03 (1,000 base draws, 95 % confidence)"
     assert said == estimate.proviso and said in estimate.details()
     assert (1 - estimate_adss(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
     assert estimate.to_dict()["unseen"] == estimate.unseen == estimate.unseen_corner
@@ -77,7 +77,9 @@ def test_without_a_failure_it_says_which_bound_has_which_level():
     assert data["cov"] is None and data["gain"] is None  # no infinities
     assert "warning: None of 1,000 simulations failed" in text and "c.o.v. not known" in text and "gain" not in text
     assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
-    assert estimate.proviso == "a failure region that no draw met: below 3.0e-03 (1,000 base draws, 95 % confidence)"
+    assert (
+        estimate.proviso == "a failure region that the search missed: below 3.0e-03 (1,000 base draws, 95 % confidence)"
+    )
 
 
 @pytest.mark.parametrize("gamma", [0.0, -0.123456789])
@@ -96,7 +98,7 @@ def test_says_what_the_problem_holds_fixed():
     problem = SimpleNamespace(dim=2, base=problem.base, evaluate=problem.evaluate, given="one die is fixed")
     fixed = samplers.estimate(problem, "mc", seed=1, max_sim=500)
     assert fixed.to_dict()["given"] == "one die is fixed"
-    assert "\n  given that one die is fixed; a failure region that no draw met: below " in fixed.details()
+    assert "\n  given that one die is fixed; a failure region that the search missed: below " in fixed.details()
     assert "\nGiven        one die is fixed\n" in str(fixed)
     assert samplers.MonteCarlo(n=500).start(problem, seed=1).result().given == "one die is fixed"
 

@@ -99,7 +99,7 @@ def test_a_method_that_cannot_be_interrupted_leaves_p_unknown(goes_on):
     result = run.result()
     assert (result.n_sim, result.status) == (10, "stopped")
     assert (result.p, result.interval, result.cov) == (0.0, (0.0, 1.0), math.inf)
-    assert any("p = 0 stands for not known" in text for text in result.warnings)
+    assert any("p = 0 means not known" in text for text in result.warnings)
 
 
 def test_a_method_must_ask_for_points_and_return_an_outcome():
@@ -137,8 +137,8 @@ def test_target_cov_keeps_to_the_budget_and_says_so(recorder):
     f = recorder(half_space().problem.f)
     result = samplers.estimate(samplers.FunctionProblem(f, 2), "adss", seed=1, target_cov=0.05, max_sim=12_000)
     assert f.rows == result.n_sim <= 12_000 and result.status == "budget"
-    assert any("target c.o.v. 0.05 was not met" in text for text in result.remarks)
-    assert not any("target" in text for text in result.warnings)  # less precise than wished is no doubt
+    assert any("target relative error 0.05 was not met" in text for text in result.remarks)
+    assert not any("target" in text for text in result.warnings)  # less precise than asked for is no doubt
 
 
 def test_target_cov_of_pooled_runs_uses_all_of_max_sim():

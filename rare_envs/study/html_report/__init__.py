@@ -29,7 +29,7 @@ from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, format_
 from rare_envs.study.html_report import figures as drawings
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.question import open_run, prepare, warn_of_changed_files
-from rare_envs.study.replay import Drive, drive_again, name_parties, read_row
+from rare_envs.study.replay import Drive, describe_contact, drive_again, read_row
 from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_finished
 from samplers.output import unfold_rows
 from samplers.problem import FloatArray
@@ -252,7 +252,7 @@ def render_page(
         usual=find_ordinary_range(draw_shown(problem)),
         describe_kind=text.describe_kind,
         probability=text.format_probability,
-        parties=name_parties,
+        contact=describe_contact,
         value=format_value,
         with_interval=text.format_with_interval,
         roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},

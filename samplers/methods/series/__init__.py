@@ -1,6 +1,6 @@
 """Settings of the search by terms: the numbers of its stages, each with its reason.
 
-Where a measurement is named, E[w^2] is the second moment of the weights of failures, on Highway-v0 with 6,000
+If a measurement is named, E[w^2] is the second moment of the weights of failures, on Highway-v0 with 6,000
 simulations: of collisions of two egos, and of `lidar_ttc` where it is named.
 """
 
@@ -59,7 +59,7 @@ class ROUNDS:
     size = 0.1  # Base draws, 100 to 2,000 of them, and the draws of an adaptive round
     base_share = 0.04  # Share of base draws in every proposal: no weight exceeds 25
     min_term_share = 0.14
-    """Least share of a term, since one heavy draw of another would leave it next to nothing; less where there are more
+    """Least share of a term, since one heavy draw of another would leave it next to nothing; less if there are more
     than five. With 0.17 two terms with 0.5 % of p took a third of the draws."""
     waiting_share = 0.35  # Weight of a term whose failures are known while another's are not
     min_failures = 5  # Failures of a term from which its means are fitted to them alone, and effective ones to know it

@@ -38,8 +38,8 @@ class Series(Method):
     3. *Estimate.* p = sum_r c_r mean(w_r 1{f <= gamma}) over three final rounds whose shares c_r are fixed beforehand.
 
     Each p_r is unbiased given what came before it: wrong terms or gradients cost accuracy, not truth. Failures of terms
-    without a proposal of their own that carry more than 5 % of p give a warning. Where a tenth of the base draws fails,
-    plain Monte Carlo takes over, and where no proposal describes the failures, adaptive subset simulation in the order
+    without a proposal of their own that carry more than 5 % of p give a warning. If a tenth of the base draws fails,
+    plain Monte Carlo takes over, and if no proposal describes the failures, adaptive subset simulation in the order
     of the terms; a remark says so. Gradients count as simulations at what they cost. Coordinates of noise are searched
     like the rest of x.
 
@@ -75,7 +75,7 @@ class Series(Method):
         check_settings(self, n=ROUNDS.min_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
-        """Walk, draw and refit, estimate; a ValueError where the problem offers no terms with gradients."""
+        """Walk, draw and refit, estimate; a ValueError if the problem offers no terms with gradients."""
         offer = offer_of(inputs)
         if offer is None or offer.gradient_cost is None:
             raise ValueError(
@@ -131,7 +131,7 @@ def combine_rounds(rounds: tuple[FinalRound, ...]) -> CombinedRounds:
 def order_by_terms(steps: Steps, gamma: float) -> Steps:
     """Run steps with the least term in place of f; the outcome's points have f again.
 
-    Values are <= gamma just where f is. Where f is no better than a flag (a collision is -1, however it happened) the
+    Values are <= gamma just where f is. If f is no better than a flag (a collision is -1, however it happened) the
     least term tells near from far. Layers are left out: they are thresholds of the order, not of f.
     """
     f_of: dict[float, float] = {}
@@ -322,7 +322,7 @@ def _run_monte_carlo(run: SeriesRun, state: SeriesState) -> Steps:
 
 
 def _fall_back(run: SeriesRun, state: SeriesState) -> Steps:
-    """Spend the rest on subset simulation in the order of the terms, with six levels where nothing is known."""
+    """Spend the rest on subset simulation in the order of the terms, with six levels if nothing is known."""
     left, gamma = run.left_at_all, run.goal.gamma
     p = min(float(np.exp(state.history.log_weights[state.history.failing(gamma)]).sum()), 1.0)
     levels = min(math.ceil(-math.log10(p)), 6) if p > 0 else 6

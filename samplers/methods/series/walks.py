@@ -46,7 +46,7 @@ def pull_back(base: Any, u: FloatArray, gradients: FloatArray, noise: NDArray[np
     """Return the gradients (n, d) by x = T(u), at u (n, d), as gradients by u, block by block: no simulation.
 
     A block with `pull_back` has its own; others are differentiated by central differences, but for noise (d,), which is
-    its own u. Where each x_i depends on its own u_i alone, as the first point shows, one difference gives all of them.
+    its own u. If each x_i depends on its own u_i alone, as the first point shows, one difference gives all of them.
     """
     if isinstance(base, StandardNormal) or noise.all():
         return gradients

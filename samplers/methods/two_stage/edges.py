@@ -1,7 +1,7 @@
 """Regression of f around a failure region: half-spaces of failure, and corners where several conditions hold at once.
 
 Around a region f is taken for the greatest of linear functions, so that y = gamma - f is the least of them, its pieces:
-y(u) = min_k (a_k + b_k.u), and all of them are at least 0 where f fails. One piece is a hyperplane, several are a
+y(u) = min_k (a_k + b_k.u), and all of them are at least 0 if f fails. One piece is a hyperplane, several are a
 corner. Points that do not agree, as those around another region, are left out.
 
 All of these are only the source of a proposal: how well they fit f decides how good it is, not whether the estimate is
@@ -63,7 +63,7 @@ class Regression(NamedTuple):
     coefficients: FloatArray
     """Slopes and intercept of each, shape (k, d + 1)."""
     own: NDArray[np.int64]
-    """Piece of each point, `NO_PIECE` where none agrees, shape (n,)."""
+    """Piece of each point, `NO_PIECE` if none agrees, shape (n,)."""
 
 
 class Pieces(NamedTuple):
@@ -107,7 +107,7 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
 
     Pieces of y = gamma - f are fitted to points u (n, d), f (n,) around failures (m, d): to all points, to those that
     fail and to those that do not, as f may jump where failure begins, or be the same in all of the region. A hyperplane
-    through all points needs an R^2 of `min_r2`; all other fits must locate where failure begins. Where f is rather the
+    through all points needs an R^2 of `min_r2`; all other fits must locate where failure begins. If f is rather the
     least of linear functions, as in a first passage, each piece of -y has a half-space of its own.
     """
     usual = _find_usual(f)
@@ -176,7 +176,7 @@ def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float
 
 
 def _beyond(fit: Pieces, failures: FloatArray) -> HalfSpaceIntersection | None:
-    """Return N(0, I) beyond the planes at which pieces are 0, the furthest first; None where that is nearly N(0, I).
+    """Return N(0, I) beyond the planes at which pieces are 0, the furthest first; None if that is nearly N(0, I).
 
     A plane begins `crossing_errors` standard errors before, or where the failures (m, d) do if the pieces do not locate
     that, and by `slack` before this. Planes that hold nearly all draws, and those that are nearly parallel to further

@@ -154,7 +154,7 @@ def descend_levels(
 ) -> SimulationSteps[SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
 
-    Where failures are common among the base draws, they are the last level.
+    If failures are common among the base draws, they are the last level.
 
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
@@ -186,7 +186,7 @@ def descend_levels(
 
 
 def _upper_end(levels: list[Chains], thresholds: list[float], goal: Goal) -> float:
-    """Return the upper end of p by subset simulation."""
+    """Return the upper limit of p by subset simulation."""
     trace = list[Level]()
     for chains, threshold in zip(levels, thresholds, strict=True):
         trace.append(level_record(chains, threshold, trace))
@@ -378,7 +378,7 @@ def find_slopes(
     """Return orthonormal directions in which f changes around the failures, shape (d, r); None where they are not few.
 
     The gradients are made in three batches. Later ones go where the known directions explain least, and are not made
-    where there are too many directions, or where the batch before was explained by what was known.
+    if there are too many directions, or if the batch before was explained by what was known.
     """
     dim = simulator.inputs.dim
     short = exploration.scattered or dim > HIGH_DIM
@@ -421,7 +421,7 @@ class _Points(NamedTuple):
 def _collect_points(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> _Points:
     """Return the ends of the chains of each region, and points beside it, each in a random order.
 
-    f may be capped within a region or beside it: points whose outcome others share have no gradient. Where failure
+    f may be capped within a region or beside it: points whose outcome others share have no gradient. If failure
     needs several things at once, a point beside the region lacks the one that all points inside may have in plenty.
     """
     groups, fails = list[FloatArray](), list[bool]()

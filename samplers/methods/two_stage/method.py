@@ -52,7 +52,7 @@ class TwoStage(Method):
        the failure region from all of these. Two failing points are of one region if the point half way between them
        fails.
     2. *Refinement* (`refinement.py`): each region is described by Gaussians, by a hyperplane from linear regression of
-       f where f is linear, by a corner of several where f is the greatest of linear functions, and by a radius.
+       f (if f is linear there), by a corner of several where f is the greatest of linear functions, and by a radius.
        Three rounds of draws follow, each from a mixture of these, and up to two more while the draws of some region
        have very uneven weights. The weights of the mixture minimise the estimated variance (`mixture.py`), with lower
        limits for the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad
@@ -74,10 +74,10 @@ class TwoStage(Method):
     tempered Gaussians. Coordinates of x that the base distribution calls noise are not searched (`methods/base.py`).
 
     *Interval* (`regions.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
-    bound where very few do. The upper end is at least Hall's, which knows the skewness of the weights, and holds the
+    bound where very few do. The upper limit is at least Hall's, which knows the skewness of the weights, and holds the
     share M of p in regions that were not found:
 
-        upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/10, nu)
+        upper limit = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/10, nu)
         nu = 2 (distinct base draws whose line or path failed + max(ESS, hits / 4) of the wide draws) / (1 + regions)
 
     Independent searches all led to known regions; a region of share M would be missed by one with probability 1 - M,
@@ -90,7 +90,7 @@ class TwoStage(Method):
     mostly M.
 
     *Other methods take over*, with a remark, where a tenth of the base draws fails, or no failure is found (plain Monte
-    Carlo), and where no mixture describes the failures (adaptive subset simulation in all coordinates): dozens of
+    Carlo), and if no mixture describes the failures (adaptive subset simulation in all coordinates): dozens of
     regions in many dimensions without a direction that matters, before the first round; after a round, where its draws
     are worth too little.
 
@@ -199,7 +199,7 @@ def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Genera
     outcome = yield from _estimate(run, state, refinement, proposal)
     if budget >= BUDGET.sufficient:
         return outcome
-    about = f"A search of {budget:,} simulations misses one of two like regions in up to 30 % of runs"
+    about = f"A search of {budget:,} simulations misses one of two equal regions in up to 30 % of runs"
     return outcome.remark_first(f"{about}; {BUDGET.sufficient:,} are recommended.")
 
 
@@ -220,7 +220,7 @@ def _draw_first(run: SearchRun, state: RunState) -> SimulationSteps[RunState]:
 
 
 def _explore(run: SearchRun, state: RunState) -> SimulationSteps[ExplorationResult]:
-    """Find the failure regions, starting from the first draws; there are none where nothing fails."""
+    """Find the failure regions, starting from the first draws; there are none if nothing fails."""
     gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
     exploration = yield from find_regions(run.simulator, state.history.batches[0], run.goal, sizes, run.rng)
     slopes = yield from find_slopes(run.simulator, exploration, gamma, run.left, run.rng)
@@ -297,7 +297,7 @@ def _gives_up(
 ) -> bool:
     """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last.
 
-    It does where the draws meet too few failures, or where the proposal is far from most of the regions found.
+    It does if the draws meet too few failures, or if the proposal is far from most of the regions found.
     """
     if run.left_at_all < LEAST_FALLBACK or not state.rounds:
         return False

@@ -114,7 +114,7 @@ LEAST_VARIANCE_OF_COMPONENT = 1e-6
 SHORT_MEAN = 1e-9
 """A mean shorter than this has no direction; its length divides."""
 TINY_WEIGHT = 1e-300
-"""Stands for 0 where a logarithm or a quotient is taken."""
+"""Stands for 0 if a logarithm or a quotient is taken."""
 
 
 class GroupedPoints(NamedTuple):
@@ -278,7 +278,7 @@ def refit_components(
 def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> SubspaceGaussian:
     """Return a component fitted to its share (n,) of weighted points.
 
-    Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
+    If the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
     """
     count = float(shares.sum())
     if count < 5:  # it stays where it is
@@ -369,7 +369,7 @@ class FloorIndex(NamedTuple):
     """Floors of k components as they are read in every update of the weights."""
 
     groups: NDArray[np.intp]
-    """Floor of each component, shape (k,); m where it has none."""
+    """Floor of each component, shape (k,); m if it has none."""
     least: list[float]
     """Least share of each, 0 without a floor; m + 1."""
 
@@ -397,7 +397,7 @@ class FloorIndex(NamedTuple):
 
 
 def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None:
-    """Return shares of groups (m,) raised to their least ones, the others lowered; None where none is too low."""
+    """Return shares of groups (m,) raised to their least ones, the others lowered; None if none is too low."""
     raised: set[int] = set()
     while True:
         low = {k for k, share in enumerate(shares) if share < least[k] - FLOOR_ROUNDING} - raised

@@ -167,7 +167,7 @@ def typical_weights(state: RefinementState, proposal: MixtureProposal, history: 
 
     The upper quartile over the chains of the mean over their likely states: those whose |u|^2 is within the weighted
     99 % quantile of the failures that the rounds have met. Chains start far from where failures are likely, and a few
-    may still be; 0 where a region has no likely state.
+    may still be; 0 if a region has no likely state.
     """
     limit = math.inf
     if len(history.u):
@@ -194,7 +194,7 @@ def least_described(state: RefinementState, u: FloatArray, log_weights: FloatArr
     """Return effective over actual failures among failing draws u (n, d), in the region where that is least.
 
     Another region may be described so well that the draws are worth enough all in all. Regions with fewer than 10 do
-    not count; 1 where no region has as many, or f is noisy.
+    not count; 1 if no region has as many, or f is noisy.
     """
     if len(u) == 0 or state.exploration.noisy:
         return 1.0

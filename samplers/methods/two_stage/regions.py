@@ -30,7 +30,7 @@ class Discovery(NamedTuple):
     regions: int = 1
     """Regions that they reached."""
     ceiling: float = 1.0
-    """Upper end of p by the search's own subset simulation, or by as many of its levels as there were."""
+    """Upper limit of p by the search's own subset simulation, or by as many of its levels as there were."""
 
     @property
     def lineages(self) -> float:
@@ -38,12 +38,12 @@ class Discovery(NamedTuple):
 
         With this 97.8 % of 648 intervals held p for 96.0 % (67 limit states), at 3,000 simulations 95.9 for 95.0 %, at
         500 96.0 for 94.9 %; on 50 states that were not looked at, 96.5 for 96.5, 97.0 for 97.0 and 96.3 for 94.1 %.
-        Searches over regions hold p as often, with twice the raise of the upper end.
+        Searches over regions hold p as often, with twice the raise of the upper limit.
         """
         return self.searches / (0.5 + 0.5 * max(self.regions, 1))
 
     def unseen_share(self, confidence: float) -> float:
-        """Return the upper end of the share of p in regions that were not found."""
+        """Return the upper limit of the share of p in regions that were not found."""
         return float(betaincinv(PRIOR_SHARE, self.lineages, 0.5 + confidence / 2))
 
 
@@ -59,7 +59,7 @@ def count_lineages(roots: int, wide_log_weights: FloatArray) -> float:
 def sampling_interval(
     draws: Draws, cov: float, confidence: float, largest_weight: float, discovery: Discovery
 ) -> Interval:
-    """Return the interval of p from weighted draws, its upper end raised by their skewness, without what is unseen."""
+    """Return the interval of p from weighted draws, its upper limit raised by their skewness, unseen regions apart."""
     low, high = weighted_interval(draws, confidence, largest_weight, cov, discovery.ceiling)
     if len(draws.f) == 0:
         return low, high
@@ -104,7 +104,7 @@ class SubsetPoints(NamedTuple):
     roots: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     """Base draws that the failing points descend from, shape (m,)."""
     ceiling: float = 1.0
-    """Upper end of p."""
+    """Upper limit of p."""
 
 
 class ExplorationResult(NamedTuple):

@@ -1,6 +1,6 @@
 """Settings of two-stage: each has its paper, or its reason and the measurement that chose it.
 
-Users set `TwoStage.n` only. Where nothing else stands beside a number, it was chosen together with the others on the
+Users set `TwoStage.n` only. If nothing else stands beside a number, it was chosen together with the others on the
 problems of the benchmark of samplers at 6,000 simulations: some 30 configurations, up to 40 runs each, by which
 differences in gain of less than a factor of two cannot be told from chance.
 """
@@ -69,7 +69,7 @@ class SLOPES:
     chains each: with the second pair 4 of 60 runs on rare_d14 were off by more than 4 of their errors, else 17."""
     shares = (0.22, 0.3)
     """Share of what is left for them at most: 17 gradients in 40 dimensions. The second one above `HIGH_DIM`
-    dimensions, and where the regions are pieces of something like a shell."""
+    dimensions, and if the regions are pieces of something like a shell."""
     most = 20  # Gradients at most. With 12, one direction of three of screen_d40 was not found in one run of 24
     few = 0.65
     """The directions are few where the gradients are worth so many equal directions, over those that as many random
@@ -126,7 +126,7 @@ class PROPOSAL:
         "spread": 0.2,
         "directional": 0.1,
     }
-    """Shares of the kinds where nothing is known yet; of those present, in proportion. Without a kind the stated
+    """Shares of the kinds if nothing is known yet; of those present, in proportion. Without a kind the stated
     variance (median) is 131 times as large on sphere_d20 (radial), 15 times on two_d30 and 4 times on three_d6 and
     steps_d6 (linear), 20 times on corner_d5 (corners, linear too), 20 times on cones_d13 (explored) and 4 times on
     sector_d6 (directional)."""

@@ -137,7 +137,7 @@ class StratifiedSample:
     def join(self, earlier: "StratifiedSample") -> "StratifiedSample":
         """Return the sample with the draws of an earlier mixture, each weighted as a draw of its own.
 
-        Where the shares of the draws do not depend on outcomes p stays unbiased, and since the later mixture makes an
+        If the shares of the draws do not depend on outcomes p stays unbiased, and since the later mixture makes an
         unbiased p of whatever came before, the errors of the two are uncorrelated.
         """
         if earlier.draws.n == 0:
@@ -249,7 +249,7 @@ def check_regions(final: StratifiedSample) -> list[str]:
 def describe_discovery(p: float, high: float, raised: float, discovery: Discovery, confidence: float) -> list[str]:
     """Return a remark if much of p may be unseen, and the interval is mostly what that adds to it.
 
-    `raised` is its upper end with the unseen share, `high` the one without.
+    `raised` is its upper limit with the unseen share, `high` the one without.
     """
     share = discovery.unseen_share(confidence)
     if share <= DOUBT.max_unseen_share or high * high > p * raised:

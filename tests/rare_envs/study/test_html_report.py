@@ -77,8 +77,8 @@ def test_the_page_says_what_the_files_say(folder: Path) -> None:
     whole = unescape(text).replace("\xa0", " ")
     for name, said in unfold_rows(result["text"][1:]):
         assert f"<dt>{name}</dt><dd>{said}</dd>" in whole
-    assert "Mode 1: the ego runs into a vehicle ahead" in text
-    assert re.search(r"the ego into the lead after \d\.\d s, at [\d.]+ m/s", text)
+    assert "Mode 1: rear-end (ego strikes)" in text
+    assert re.search(r"the ego rear-ends the lead after \d\.\d s, at [\d.]+ m/s", text)
     assert "m/s of it, at right angles to what touches" in text and result["proviso"].split(" (")[0] in text
     for name in ("ego_speed [m/s]", "lead_speed [m/s]", "gap [m]"):
         assert name in text
@@ -95,12 +95,12 @@ def test_warnings_come_first_and_text_of_files_is_escaped(
     run = tmp_path / "run"
     shutil.copytree(folder, run)
     result = json.loads((run / "result.json").read_text())
-    coarse = "<script>alert(1)</script> the estimate is coarse"
+    coarse = "<script>alert(1)</script> the estimate is imprecise"
     result |= {"warnings": [coarse], "doubts": [coarse], "notes": ["<b>a note</b>"]}
     (run / "result.json").write_text(json.dumps(result))
     text = write_html_report(run)[0].read_text(encoding="utf-8")
-    assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is coarse" in text
-    assert text.index("the estimate is coarse") < text.index("Kinds of crash")
+    assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is imprecise" in text
+    assert text.index("the estimate is imprecise") < text.index("Kinds of crash")
     assert "&lt;b&gt;a note" in text
     assert "not what the run wrote, by the digests in its study.json: result.json" in text
 

@@ -59,7 +59,7 @@ def test_nothing_failed(tmp_path: Path) -> None:
     report = run(prepare(question(base, max_sim=100)))
     assert report.estimate.p == 0.0 == report.rate.per_million_km
     assert report.rate.interval_per_million_km[1] >= 1e6 * 42 / 218 * report.estimate.interval[1]
-    assert "not known without a failure" in describe_left_out(report.study, report.estimate)
+    assert "not known before a failure" in describe_left_out(report.study, report.estimate)
 
 
 def test_what_counts_no_collisions_has_no_rate(bases: dict[str, str]) -> None:
@@ -158,11 +158,21 @@ def test_other_sites_are_known_from_the_same_simulations(monkeypatch: pytest.Mon
 
 
 def test_a_rate_has_two_digits_and_with_its_interval_one_form() -> None:
-    rates = (12345.0, "12,000"), (99.6, "100"), (9.99, "10"), (0.0123, "0.012"), (0.00999, "1.0e-02")
+    rates = (
+        (12345.0, "12,000"),
+        (99.6, "100"),
+        (9.99, "10"),
+        (0.0123, "0.012"),
+        (0.00999, "0.010"),
+        (2.3e-4, "0.00023"),
+        (9e-5, "9.0e-05"),
+    )
     assert [format_rate(value) for value, _ in rates] == [text for _, text in rates]
     for value, interval, text in (
         (0.011, (0.001, 0.12), "0.011 (0.0010 to 0.12)"),
-        (0.003, (0.0004, 0.012), "3.0e-03 (4.0e-04 to 1.2e-02)"),
+        (0.003, (0.0004, 0.012), "0.0030 (0.00040 to 0.012)"),
+        (3e-4, (4e-6, 0.05), "3.0e-04 (4.0e-06 to 5.0e-02)"),
+        (0.0018, (3e-5, 1.9), "0.0018 (3.0e-05 to 1.9)"),
         (11.0, (0.16, 820.0), "11 (0.16 to 820)"),
         (2e-7, (0.0, 1700.0), "2.0e-07 (below 1,700)"),
     ):
@@ -216,7 +226,7 @@ def test_each_event_stands_beside_people_in_it() -> None:
     lines = tabulate_events([replace(events[0], parts={"looked": 0.08, "unseen": 0.92}), *events[1:]])
     assert "0.31 (0.0079 to 1.7)" in lines[1] and lines[2] == "  of which unseen 92 %, looked 8 %"
     vague = replace(events[0], parts={"looked": 1e-9, "unseen": 1.0}, unresolved={"looked": 2.58})
-    assert tabulate_events([vague])[2] == "  of which unseen 100 %; looked is not resolved, below 2.6"
+    assert tabulate_events([vague])[2] == "  of which unseen 100 %; stratum looked: too few failures found, below 2.6"
     assert "4.0 (2.2 to 6.9)" in lines[3] and "uncalibrated" not in lines[3]
 
 
@@ -293,7 +303,7 @@ def test_the_calibration_is_that_of_the_base_and_a_miss_by_more_than_three_has_i
     assert at_home.uncalibrated == ""
     factor = elsewhere.calibration.drivers["human"]["contacts"].p * elsewhere.calibration.per_km * 3.2187e6 / 5.572
     assert factor > 3.0 and elsewhere.uncalibrated == f"uncalibrated, {factor:.2g} times above people's interval"
-    assert describe_calibration(at_home).endswith("within a factor 3 of people's interval")
+    assert describe_calibration(at_home).endswith("within a factor of 3 of people's interval")
     assert describe_calibration(elsewhere).endswith(f", {factor:.2g} times above people's interval")
 
 

@@ -64,10 +64,10 @@ def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
     assert found.interval is found.expected is None
     half = 2.119905 * math.sqrt(found.spread**2 + result.cov**2 + 0.04)
     assert found.bound == pytest.approx(min(1.0, result.p * math.exp(half)), rel=1e-6)
-    assert "the events do not determine p; nor an upper end in this family" in result.details()
+    assert "too few recorded events for limits in this family" in result.details()
     assert "predictive mean" not in result.details()
-    assert "no lower limit\nLimited by   " in str(result)
-    assert "do not determine p; below 1.0e-02 in this family" in str(replace(found, bound=0.01))
+    assert "neither a lower nor an upper limit (95 %)\nLimited by   " in str(result)
+    assert "too few recorded events for a lower limit; below 0.010 in this family" in str(replace(found, bound=0.01))
 
 
 def test_a_base_without_refits_prints_what_it_did():
@@ -112,7 +112,7 @@ def test_after_hardly_any_simulations_one_line_says_what_is_known(method, max_si
         assert 0.0 <= found.interval[0] <= result.p <= found.interval[1] <= 1.0
         assert line.startswith("base distribution 95 %")
     else:
-        assert line.startswith(("base distribution  no interval: ", "base distribution  the events do not determine p"))
+        assert line.startswith(("base distribution  no interval: ", "base distribution  too few recorded events for "))
         assert "nothing failed" in line or result.p > 0
     assert "nan" not in line and "inf " not in line
     json.loads(result.to_json())
@@ -154,10 +154,11 @@ def test_the_further_run_knows_p_of_the_refits_and_leaves_p_as_it_is():
     assert 0 < found.n_sim == result.ensemble_run.n_sim <= 3000  # max_sim limits it anew
     assert np.log(found.value_refits) == pytest.approx(np.log([refit.p for refit in FAR]), abs=0.3)
     assert min(found.ess_refits) > 10
-    assert f"from a further {found.n_sim:,} simulations under their mixture" in result.details()
+    assert f"with {found.n_sim:,} more simulations from the mixture of the refits" in result.details()
     assert sum(ess < 10 for ess in without.base_uncertainty.ess_refits) == 4
     assert without.base_uncertainty.warnings == (
-        "4 of 30 refits rest on under 10 effective failing points: the spread is coarse.",
+        "4 of 30 refits rest on fewer than 10 effective failing points: their interval is imprecise; "
+        "more simulations (max_sim) help.",
     )
     assert "\nWarning      4 of 30 refits" in str(without)
     assert result.ensemble_run.p == pytest.approx(np.mean([refit.p for refit in FAR]), rel=0.1)

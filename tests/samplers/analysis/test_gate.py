@@ -70,10 +70,10 @@ def test_an_undecided_limit_names_what_would_decide_it() -> None:
 def test_a_warning_that_p_may_be_wrong_leaves_it_undecided() -> None:
     verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4, None)
     assert verdict.decision == "undecided" and "a warning says that p may be wrong: weights are un" in str(verdict)
-    doubtful = replace(BASE, warnings=("the spread is coarse.",))
+    doubtful = replace(BASE, warnings=("the spread is large.",))
     assert judge_estimate(Known(), 2e-3, doubtful).decision == "undecided"
     few = samplers.estimate(samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1), "mc", seed=0, max_sim=2000)
-    assert 0 < few.failures.total < 5 and "the estimate is coarse" in few.warnings[0]
+    assert 0 < few.failures.total < 5 and "the estimate is imprecise" in few.warnings[0]
     assert few.meets(0.02).decision == "passes" and few.meets(1e-3).decision == "undecided"
 
 

@@ -47,10 +47,10 @@ def test_the_further_run_of_a_comparison_simulates_both():
     assert 0 < found.n_sim <= 6000
     assert 0 < found.base_uncertainty.n_sim <= 6000
     assert np.log(found.base_uncertainty.value_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
-    assert f"{found.base_uncertainty.n_sim:,} simulations under their mixture" in str(found)
+    assert f"{found.base_uncertainty.n_sim:,} more simulations from the mixture of the refits" in str(found)
     forbidden = samplers.compare(*both, seed=2, max_sim=6000, ensemble_run=False)
     assert forbidden.base_uncertainty.n_sim == 0
-    assert "rest on under 10" in forbidden.base_uncertainty.warnings[0]
+    assert "rest on fewer than 10" in forbidden.base_uncertainty.warnings[0]
 
 
 def test_the_interval_of_a_comparison_holds_that_of_its_sampling():
@@ -64,8 +64,8 @@ def test_the_interval_of_a_comparison_holds_that_of_its_sampling():
 def test_one_that_never_fails_leaves_no_interval():
     found = samplers.compare(HalfSpace(BASE, 2.0), HalfSpace(BASE, 9.0), "mc", seed=2, max_sim=2000).base_uncertainty
     assert found.interval is None
-    assert found.reason == "one of the two never failed."
-    assert str(found) == "base distribution  no interval: one of the two never failed."
+    assert found.reason == "A or B never failed."
+    assert str(found) == "base distribution  no interval: A or B never failed."
     assert found.to_dict()["value"] is None
 
 
@@ -74,7 +74,7 @@ def test_ratios_that_the_events_do_not_determine():
     found = summarise_refits(2.0, 0.1, 0.95, BASE, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert found.interval is None
     assert found.spread == pytest.approx(log_p[0].std(ddof=1))
-    assert "the events do not determine the ratio: the spread of its logarithm is 5." in str(found)
+    assert "too few recorded events for limits of the ratio (standard deviation of its logarithm 5." in str(found)
     log_p[1, 3] = -np.inf
     unknown = summarise_refits(2.0, 0.1, 0.95, BASE, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
     assert unknown.reason.startswith("1 of 30 refits have no density")

@@ -204,7 +204,12 @@ def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> Non
     assert length == pytest.approx(2000 * answer["seconds"] + 1000, abs=1)  # half speed, and the end stays 1 s
     words = cli("replay", run, "--out", "worst.png").stdout
     n_found = json.loads((run / "result.json").read_text())["n_failures"]
-    for said in (f"Failure 0 of {n_found} found in ", "ego_speed", "the ego into the lead (rear_end", "worst.png"):
+    for said in (
+        f"Failure 0 of {n_found} found in ",
+        "ego_speed",
+        "the ego rear-ends the lead, closing at",
+        "worst.png",
+    ):
         assert said in words
 
 
@@ -284,5 +289,5 @@ def test_p_under_other_bases(cli: Cli, here: Path) -> None:
     assert one["refused"] == "" and one["interval"][0] < one["p"] < one["interval"][1]
     assert "effective" in other["refused"] or "worth" in other["refused"]
     text = " ".join(cli(*words).stdout.split())
-    assert f"under {near} " in text and f"under {far} not known: " in text
+    assert f"with {near} " in text and f"with {far} not known: " in text
     assert_refused(cli(*BRAKE, "--base", base, "--also-under", "nowhere"), "nowhere")

@@ -43,8 +43,8 @@ def test_an_upper_bound_by_plain_monte_carlo_is_an_answer(cli: Cli, safe: str, t
     result = cli(*SMALL, "--base", safe, "--out", tmp_path / "run")
     assert result.exit_code == 0
     assert "Warning" not in result.stdout
-    assert "none in 2,000 simulations; below 1.8e-03 (95 %)\n" in result.stdout
-    assert "failures of a kind rarer than 1.5e-03 (95 %) that no simulation came near\n" in result.stdout
+    assert "none in 2,000 simulations; below 0.0018 (95 %)\n" in result.stdout
+    assert "failure modes rarer than 0.0015 (95 %) that the search did not find\n" in result.stdout
     written = json.loads((tmp_path / "run" / "result.json").read_text())
     assert written["doubtful"] is False and written["doubts"] == []
     assert written["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 2000))
@@ -60,7 +60,7 @@ def test_the_answer_is_short_unless_details_are_asked_for(cli: Cli, risky: str, 
     )
     assert len(lines) <= 12 and max(map(len, lines)) < 100 and "c.o.v. 0." not in short
     assert long.startswith(short) and "c.o.v. 0." in long
-    assert lines[-1] == "Next         --details (method, c.o.v., all intervals, remarks)"
+    assert lines[-1] == "Next         --details (method, relative error, all intervals, remarks)"
     text = cli(*words, "--out", tmp_path / "a b").stdout
     assert f"Next         rare-envs report '{tmp_path / 'a b'}'" in text
     assert json.loads((tmp_path / "a b" / "result.json").read_text())["text"] == lines[:-1]
@@ -68,12 +68,13 @@ def test_the_answer_is_short_unless_details_are_asked_for(cli: Cli, risky: str, 
 
 def test_what_is_unusual_in_the_most_likely_failure_is_named(cli: Cli, risky: str, tmp_path: Path) -> None:
     shown = " ".join(cli(*SMALL, "--base", risky, "--out", tmp_path).stdout.split())
-    named = re.findall(r"(\w+) (-?[\d.]+) (?:m|m/s) \(usually (-?[\d.]+) to (-?[\d.]+)\)", shown)
+    named = re.findall(r"(ego at|lead at|gap) (-?[\d.]+) (?:m|m/s) \(usually (-?[\d.]+) to (-?[\d.]+)\)", shown)
     failure = json.loads((tmp_path / "result.json").read_text())["failures"][0]["parameters"]
-    for name, value, low, high in named:
+    for words, value, low, high in named:
+        name = {"ego at": "ego_speed", "lead at": "lead_speed"}.get(words, words)
         assert float(value) == pytest.approx(failure[name], rel=0.05)
         assert not float(low) <= failure[name] <= float(high)
-    assert bool(named) != ("every parameter usual" in shown)
+    assert bool(named) != ("all parameters in their usual range" in shown)
 
 
 def test_a_gate_is_one_sentence_and_recorded(cli: Cli, risky: str, tmp_path: Path) -> None:
