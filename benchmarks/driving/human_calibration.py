@@ -96,7 +96,7 @@ CHANGES: Mapping[str, Change] = {
     "no glances": Change(("looked", *_BRAKES), {"glances": False}),
     "no headway rule for glances": Change(("looked", *_BRAKES), {"headway_rule": False}),
     "glances not broken off by looming": Change(_BRAKES, {"glance_eccentricity": 180.0}),
-    "glances begun whatever closes": Change(_BRAKES, {"glance_looming": math.inf}),
+    "glances begun even while closing": Change(_BRAKES, {"glance_looming": math.inf}),
     "no headway rule, glances not broken off": Change(_BRAKES, {"headway_rule": False, "glance_eccentricity": 180.0}),
     "no constant-acceleration heuristic": Change(("looked", *_BRAKES), {"coolness": 0.0}),
     "the heuristic behind brake lights too": Change(_BRAKES, {"brake_light": math.inf}),
@@ -106,9 +106,7 @@ CHANGES: Mapping[str, Change] = {
     "the cutter never looks": Change(("looked",), {}, {"looks": False}),
     "it turns back above 4 m/s^2, not 2": Change(("looked",), {}, {"most_braking": 4.0}),
     "the cutter follows its lead by IDM": Change(("looked",), {}, {"coolness": None}),
-    "it wishes for no more than its initial speed": Change(
-        _CUT_INS, {}, {"idm": replace(ATTENTIVE_IDM, desired_speed=1.0)}
-    ),
+    "it wants no more than its initial speed": Change(_CUT_INS, {}, {"idm": replace(ATTENTIVE_IDM, desired_speed=1.0)}),
     "the lead keeps its speed": Change(("looked",), {}, {"brakings_per_km": 0.0}),
     "gaps that nobody accepts": Change(("looked",), {}, {}, "-test"),
     "gaps that nobody accepts, never looks": Change(("looked",), {}, {"looks": False}, "-test"),
@@ -353,7 +351,7 @@ def format_events(found: Mapping[Event, EventCalibration], site: str) -> list[st
                 values += [show(of[outcome], scale, ".2g") for outcome in OUTCOMES]
                 lines.append(f"| {ego} | {' | '.join(values)} |")
             else:
-                vague.append(f"{ego} had none in too few draws to say more than {show(of['contacts'])}")
+                vague.append(f"{ego} had none, but too few draws: {show(of['contacts'])}")
         lines += ["", *(f"{'; '.join(vague)}.\n" for _ in vague[:1])]
     return lines
 
@@ -402,7 +400,7 @@ def judge_cutters(cells: Sequence[CalibrationCell], site: str) -> list[str]:
     return [
         f"Contacts among the conflicts with cutters who had not looked: {low:.1%} to {high:.1%}; people none of 44 "
         "own and none of 58 sideswipe conflicts, under 3.6 %.",
-        f"P(near-crash | not looked) is {near:.3f}, which gives a share of {share:.2e} (the base has "
+        f"P(near-crash | not looked) is {near:.3f}, which gives a share of {share:.2e} (traffic model: "
         f"{shares['unseen']:.2e}).",
         f"By type, in the 100-Car's distance: {own:.0f} near-crashes at cut-ins that the ego avoids (people: 74 "
         f"rear-end), {theirs:.0f} that the cutter avoids (people: 58 sideswipe).",
@@ -413,9 +411,8 @@ def format_measured(cells: Sequence[CalibrationCell], sites: Sequence[str], comm
     """Return the measured part of the page."""
     lines = [
         f"{MEASURED}\n",
-        f"`{command}`; intervals of 95 % are of sampling, and of people's counts, alone: the share of cutters who had "
-        "not looked and the frequencies of events count as exact. `vision`, too slow to count, is among the "
-        "[results](results.md).\n",
+        f"`{command}`; 95 % intervals cover sampling and people's counts only: the share of cutters who had not looked "
+        "and the frequencies of events are taken as exact. `vision` is too slow to count ([results](results.md)).\n",
         *format_events(calibrate(cells, sites[0]), sites[0]),
         "### Targets\n",
     ]
@@ -423,7 +420,7 @@ def format_measured(cells: Sequence[CalibrationCell], sites: Sequence[str], comm
     for site in sites[1:]:
         lines += [f"* At {site}: {each}" for each in judge(calibrate(cells, site))]
     of_human = [c for c in cells if (c.site, c.ego) == (sites[0], HUMAN)]
-    lines += ["", *format_changes(of_human, f"### Parts taken away one at a time, `human` on {sites[0]}")]
+    lines += ["", *format_changes(of_human, f"### Effect of each part, `human` on {sites[0]}")]
     return "\n".join(lines).rstrip() + "\n"
 
 
