@@ -11,6 +11,7 @@ from rare_envs.control.actions import ACTIONS
 from rare_envs.distributions.fitted import join_independent
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
+from rare_envs.egos.policy import find_policies
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import check_name, did_you_mean
 from rare_envs.scenarios.base import Scenario, load_base
@@ -69,9 +70,9 @@ def set_up(
         base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
             distribution object; None takes the scenario's default.
         drivers: Drivers of the vehicles around the ego: "mgail", "mgail?rules=0", "gail", "idm", "idm+mobil"
-            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`; None takes
-            the scenario's default, which is its script but for the highway. The weights of learned drivers are
-            parameters of the scenario.
+            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`; or of
+            single ones, see `rare_envs.egos.policy.find_policies`. None takes the scenario's default, which is its
+            script but for the highway. The weights of learned drivers are parameters of the scenario.
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
@@ -95,11 +96,14 @@ def set_up(
     check_name("action", action, ACTIONS)
     if not isinstance(weather, bool):
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
-    background = find_drivers(scenario.drivers if drivers is None else drivers)
+    policies = find_policies(drivers, scenario)
+    background = find_drivers(scenario.drivers if drivers is None or policies else drivers)
+    lidar = needs.lidar or any("lidar" in policy.driver.observation for policy in policies)
     world = World(
         scenario,
-        sensing=Sensing(kinds, find_camera(camera), weather, needs.lidar),
+        sensing=Sensing(kinds, find_camera(camera), weather, lidar),
         background=background,
+        policies=policies,
         measurement=Measurement(load_measure(measure), collisions),
         clock=Clock(dt, scenario.horizon if horizon is None else horizon, action),
         noise=noise,

@@ -19,10 +19,8 @@ from rare_envs.simulation.decision import (
     run_ticks,
 )
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import Driver, World
-from rare_envs.traffic.bodies import overlaps, select_pairs
-from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import State
+from rare_envs.simulation.world import Driver, World, roll_out
+from rare_envs.traffic.bodies import find_struck, find_touching
 
 __all__ = ["AdversaryTerms", "Transition", "adversary_reward", "own_reward", "play"]
 
@@ -71,11 +69,9 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
     """
     traffic, disabled, road = episode.traffic, episode.disabled, world.scenario.road
     active = commanded | disabled
-    speed = traffic.state.speed
-    rolling_out = torch.stack((-speed, torch.zeros_like(speed)), dim=-1)
-    traffic = world.step(traffic, torch.where(disabled[..., None], rolling_out, action), active)
+    traffic = world.step(traffic, roll_out(traffic.state, disabled, action), active)
     state = traffic.state
-    touching, off = _touching(state, road), road.off_road(state.y)
+    touching, off = find_touching(state, road), road.off_road(state.y)
     hit = touching.any(dim=2)
     if world.measurement.collisions == "any":
         hit = hit.any(dim=1, keepdim=True)
@@ -88,17 +84,7 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
         hold_finished(old.collided, old, new) if bool(old.collided.any()) else new
         for old, new in zip(episode.views, views, strict=True)
     )
-    active = active | (torch.arange(active.shape[1], device=active.device) == 0)
-    struck = (touching & (active[:, :, None] | active[:, None, :])).any(dim=2) | (off & active)
-    return MultiAgentEpisode(traffic, held, disabled | struck)
-
-
-def _touching(state: State, road: Road) -> Tensor:
-    """Return which bodies overlap which, boolean, (B, N, N), symmetric, nobody with itself."""
-    first, second = select_pairs(state, "all")
-    touching = torch.zeros(*state.x.shape, state.x.shape[1], dtype=torch.bool, device=state.x.device)
-    touching[:, first, second] = touching[:, second, first] = overlaps(state, road, "all")
-    return touching
+    return MultiAgentEpisode(traffic, held, disabled | find_struck(touching, off, active))
 
 
 def view_order(vehicle: int, vehicles: int) -> list[int]:

@@ -217,6 +217,8 @@ class DrivingProblem:
     def given(self) -> str:
         """Condition of p, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
         fixed = ["the ego's own noise is not part of x, so that failures may not replay"] if self.varies else []
+        names = self.world.scenario.vehicle_names
+        fixed += [f"{policy.name} drives the {names[policy.vehicle]}" for policy in self.world.policies]
         if self.world.noise != "fixed":
             return ", ".join(fixed)
         if hasattr(self.driver, "with_draws"):
@@ -415,6 +417,8 @@ class DrivingProblem:
     def _replay(self, world: World, rows: Tensor) -> Episode | None:
         """Return the episodes of x (B, d) on a GPU; None where the CPU has to ask a policy, or to tell how it fails."""
         known = self._recorded
+        if world.policies:
+            return None
         driver = find_device_driver(self.driver, self.device, None if known is None else known.driver)
         if driver is None:
             return None

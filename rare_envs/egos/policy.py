@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,14 +18,26 @@ from torch import Tensor
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS, read_actions, to_physical
 from rare_envs.devices import move_to
 from rare_envs.egos.dense_policies import DensePolicy, find_inference
-from rare_envs.egos.needs import RULE_BASED_EGOS, EgoNeeds, ModuleEgo, find_rule_based, resolve, takes_indices
+from rare_envs.egos.needs import (
+    RULE_BASED_EGOS,
+    EgoNeeds,
+    ModuleEgo,
+    choose_action,
+    choose_observation,
+    find_rule_based,
+    load_named_ego,
+    resolve,
+    takes_indices,
+    wrap_callable,
+)
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
-from rare_envs.plugins import NoAnswer, as_errors, reason_of, refuse_ego
+from rare_envs.plugins import NoAnswer, as_errors, check_name, is_policy, reason_of, refuse_ego
 from rare_envs.simulation.background import Background, TrafficBackground
-from rare_envs.simulation.observation import map_kinds, observe
-from rare_envs.simulation.world import Driver, World
+from rare_envs.simulation.observation import map_kinds, observation_space, observe
+from rare_envs.simulation.world import Driver, TrafficPolicy, World
 
 if TYPE_CHECKING:
+    from rare_envs.scenarios.base import Scenario
     from rare_envs.simulation.episode import Episode
 
 
@@ -223,6 +237,57 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
         driver = ego
         return driver
     refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
+
+
+def find_policies(drivers: Any, scenario: Scenario) -> tuple[TrafficPolicy, ...]:
+    """Return the policies that an argument `drivers` puts in single vehicles around the ego; none of all other drivers.
+
+    Args:
+        drivers: A policy or its file (.zip, .onnx), for the first of these vehicles; a mapping of their names
+            (`Scenario.vehicle_names`) to policies or files, also as "cutter=a.zip,lead=b.zip".
+        scenario: The scenario.
+
+    Raises:
+        ValueError: There is no such vehicle; or the policy does not fit an agent of `rare_envs.parallel_env` with
+            continuous actions.
+    """
+    _, *names = scenario.vehicle_names
+    given = drivers
+    if isinstance(drivers, str | Path):
+        parts = [str(each).partition("=") for each in str(drivers).split(",")]
+        named = all(mark and name.isidentifier() for name, mark, _ in parts)
+        given = {name: file for name, _, file in parts} if named else drivers
+        if not named and not str(drivers).endswith(POLICY_SUFFIXES):
+            return ()
+        if named and len(given) < len(parts):
+            raise ValueError(f"Expected one driver for each vehicle, got {drivers}.")
+    elif not isinstance(drivers, Mapping) and not is_policy(drivers):
+        return ()
+    given = given if isinstance(given, Mapping) else {names[0]: given}
+    for name in given:
+        check_name("vehicle of the traffic", name, names)
+    return tuple(
+        TrafficPolicy(names.index(name) + 1, *_place_policy(name, policy, scenario)) for name, policy in given.items()
+    )
+
+
+POLICY_SUFFIXES = (".zip", ".onnx")
+"""Endings of the files of policies that can drive traffic."""
+
+
+def _place_policy(name: str, given: Any, scenario: Scenario) -> tuple[Driver, str]:
+    """Return the driver that a policy is in a vehicle's place, and its name."""
+    policy = wrap_callable(load_named_ego(given))
+    words = str(given) if isinstance(given, str | Path) else type(policy).__name__
+    if not is_policy(policy):
+        raise ValueError(f"Expected a policy with predict, or its file, to drive the {name}, got {words}.")
+    needs = resolve(policy, scenario.vehicles)
+    kinds = choose_observation(needs, scenario.vehicles)
+    if "camera" in kinds:
+        raise ValueError(f"Expected a policy without a camera to drive the {name}, got {words}.")
+    space = observation_space(scenario.vehicles, kinds)
+    check_spaces(policy, space, choose_action(needs.action_space, kinds), needs.observation)
+    return PolicyDriver(wrap_policy(policy, space), kinds), words
 
 
 def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features") -> None:

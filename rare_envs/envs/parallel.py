@@ -49,6 +49,8 @@ class _SeveralAgents:
         acted, seen = needs.action_space if needs.queries_policy else None, settings.get("observation", "features")
         kind = settings.get("action") or choose_action(acted, read_kinds(seen))
         world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **{**settings, "action": kind})
+        if world.policies:
+            raise ValueError("Expected drivers of all vehicles here: policies in single ones act as agents, by step().")
         self.world = world.with_statistics()
         vehicles = self.world.scenario.vehicle_names
         names = _select_agents(vehicles, agents)

@@ -103,7 +103,7 @@ def find_script(world: World, statistics: bool = False) -> Script:
     names = [name for name, vehicles in known if scenario.vehicles == vehicles]
     _refuse(
         {
-            "worlds with drivers are": world.background is not None,
+            "worlds with drivers are": world.background is not None or bool(world.policies),
             f"the script of the scenario {scenario.name!r} is": not known,
             f"the script of {scenario.name!r} for {scenario.vehicles} vehicles is": not names,
             "curved roads and lanes of different widths are": scenario.road.reference_line is not None

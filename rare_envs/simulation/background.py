@@ -163,6 +163,6 @@ def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     offered = "file" if name.endswith(".safetensors") else name.partition("?")[0].partition("+")[0]
     if offered not in known:
         names = sorted({*known, *(f"{name}+mobil" for name in known if name == "idm")} - {"file"})
-        check_name("drivers", name, [*names, "FILE.safetensors"])
+        check_name("drivers", name, [*names, "FILE.safetensors", "VEHICLE=POLICY.zip"])
     background: Background | TrafficBackground = known[offered].load()(name)
     return background

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -91,6 +91,10 @@ class Episode(NamedTuple):
     overridden: Tensor | None = None
     """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
     anyone but the ego has been."""
+    disabled: Tensor | None = None
+    """Which vehicles have crashed and roll out, boolean, shape (B, N); None in a world without policies in traffic."""
+    memories: Mapping[int, Any] | None = None
+    """Memories of the policies in traffic, by vehicle."""
     measure: EpisodeMeasure = MEASURES["ttc"]
     aim: Aim | None = None
     """Aims of the controllers of vehicles with meta-actions, (B, N) each; None in a world without such actions."""

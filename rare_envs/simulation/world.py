@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from gymnasium import spaces
@@ -35,7 +35,7 @@ from rare_envs.simulation.background import (
 from rare_envs.simulation.episode import LEARNED_TICK, Episode, EpisodeStatistics
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.settings import Clock, Measurement, Sensing
-from rare_envs.traffic.bodies import lead_of, overlaps
+from rare_envs.traffic.bodies import find_struck, find_touching, lead_of, overlaps
 from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import State, bicycle
 
@@ -47,6 +47,15 @@ def noise_block(name: str, meaning: str, size: int) -> list[Block]:
     """Return one parameter of so many standard normal columns; none of 0 columns."""
     parameter = Parameter(name, "", -math.inf, math.inf, meaning, size)
     return [((parameter,), NoiseDistribution(size))] if size else []
+
+
+class TrafficPolicy(NamedTuple):
+    """A policy in the place of a vehicle around the ego, without a memory of its own."""
+
+    vehicle: int
+    driver: Driver
+    name: str
+    """Its file, or its class."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,8 @@ class World:
     """Time; without a horizon, that of the scenario."""
     noise: bool | str = True
     """Noise of drivers and camera: True, part of x; "fixed", one sequence for all x; False, none."""
+    policies: tuple[TrafficPolicy, ...] = ()
+    """Policies that drive single vehicles of the traffic, as agents of `rare_envs.parallel_env` do."""
     rapid: bool = True
     """Whether the ego's actions may be rapid manoeuvres; if not, `avoid_rapid` limits them."""
 
@@ -158,7 +169,9 @@ class World:
                 shape = (1, FIRST_DRAWS + self.clock.ticks, others, 2)
                 draws = fixed_draws(shape, FIXED_SEED, noise).expand(batch, -1, -1, -1)
             background = BackgroundState.start(self.background, weights.contiguous(), draws)
-        return self.start_from(state, self._look(state)[1], background, self.sensing.start_camera(weather, key))
+        episode = self.start_from(state, self._look(state)[1], background, self.sensing.start_camera(weather, key))
+        none = torch.zeros_like(state.x, dtype=torch.bool)
+        return episode._replace(overridden=none, disabled=none) if self.policies else episode
 
     def start_from(
         self,
@@ -239,6 +252,8 @@ class World:
         Returns:
             The episodes one tick later.
         """
+        if self.policies:
+            episode, action, commanded = command_policies(self.policies, episode, action)
         old, dt, road, background_state = episode.state, self.clock.dt, episode.road, episode.background_state
         ego, (acceleration, steering) = old.vehicles[0], (action if commanded is None else action[:, 0]).unbind(1)
         curvature = None if road.reference_line is None else road.curvature(ego.x)
@@ -263,6 +278,9 @@ class World:
         hit = overlaps(state, road, "ego", place).any(dim=1) | road.off_road(state.vehicles[0].y)
         if self.measurement.collisions == "any":
             hit = hit | overlaps(state, road, "others").any(dim=1)
+        if episode.disabled is not None and commanded is not None:
+            struck = find_struck(find_touching(state, road), road.off_road(state.y), commanded)
+            episode = episode._replace(disabled=episode.disabled | struck)
         episode = episode._replace(background_state=background_state, overridden=overridden)
         return self.update(episode, state, perception, hit)
 
@@ -298,6 +316,33 @@ class World:
             return None, None
         place = self.scenario.road.place(state.x, state.y, state.heading)
         return place, perceive_traffic(state, self.scenario.road, place)
+
+
+def roll_out(state: State, disabled: Tensor, action: Tensor) -> Tensor:
+    """Return actions (B, N, 2), in place of those of crashed vehicles (B, N) what HighwayEnv's do: slow down ahead."""
+    rolling = torch.stack((-state.speed, torch.zeros_like(state.speed)), dim=-1)
+    return torch.where(disabled[..., None], rolling, action)
+
+
+def command_policies(
+    policies: Sequence[TrafficPolicy], episode: Episode, action: Tensor
+) -> tuple[Episode, Tensor, Tensor]:
+    """Return the actions (B, N, 2) of all vehicles, the ego's (B, 2) among them, and which are commanded, (B, N)."""
+    state, memories = episode.state, dict(episode.memories or {})
+    disabled = torch.zeros_like(state.x, dtype=torch.bool) if episode.disabled is None else episode.disabled
+    actions, commanded = torch.zeros(*state.x.shape, 2).to(action), disabled.clone()
+    actions[:, 0] = action
+    for vehicle, driver, name in policies:
+        seen = state.seen_by(vehicle)
+        own = None if episode.perception is None else episode.perception[:, vehicle : vehicle + 1]
+        view = episode._replace(
+            state=seen, lead=lead_of(seen, episode.road), collided=disabled[:, vehicle], perception=own
+        )
+        actions[:, vehicle], memory = driver.act(view, memories.get(vehicle))
+        if memory is not None and memory[0] is not None:
+            raise ValueError(f"Expected a policy without a memory to drive traffic, got {name}, which has one.")
+        memories[vehicle], commanded[:, vehicle] = memory, True
+    return episode._replace(memories=memories), roll_out(state, disabled, actions), commanded
 
 
 _RULE = IDM()

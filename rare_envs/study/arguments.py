@@ -171,7 +171,9 @@ class Question:
 
     env_id: str = field(metadata={"help": "Environment, such as rare_envs/CutIn-v0.", "option": "env"})
     base: str | None = arg(None, "Base distribution: a name or a JSON file.")
-    drivers: str | None = arg(None, "Of the vehicles around: mgail, mgail?rules=0, gail, idm, idm+mobil or a file.")
+    drivers: str | None = arg(
+        None, "Of the vehicles around: mgail, mgail?rules=0, gail, idm, idm+mobil, a file, or cutter=POLICY.zip."
+    )
     observation: str | None = arg(
         None,
         "Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "

@@ -225,7 +225,8 @@ def _answers_vary(problem: DrivingProblem, on_error: str) -> bool:
 def digest_files(question: Question) -> dict[str, str]:
     """Return the digests of the files that a question names, by path; modules are found, not imported."""
     bases = map(str.strip, (question.also_under or "").split(","))
-    names = filter(None, (question.base, question.drivers, question.measure, *bases))
+    drivers = (each.rpartition("=")[2] for each in (question.drivers or "").split(","))
+    names = filter(None, (question.base, *drivers, question.measure, *bases))
     with as_bad_input(OSError, ValueError):
         paths = {path for name in names if not name.startswith(HUB_PREFIX) for path in find_named_files(name)}
         return {str(path): digest_file(path) for path in sorted(paths | set(find_ego_files(question)))}

@@ -84,6 +84,8 @@ def explain_other_events(question: Question) -> str:
 def find_frequency(study: Study) -> EventFrequency:
     """Return the frequency of the events whose failures a question counts, or raise a ValueError that says why not."""
     base, reason = study.fitted, explain_other_events(study.question)
+    if not reason and study.problem.world.policies:
+        reason = f"events are counted in ordinary traffic, not with --drivers {study.question.drivers}"
     if not reason and base is not None and base.frequency is not None:
         return base.frequency
     if not reason:

@@ -337,3 +337,20 @@ def nearest(distance: Tensor, among: Tensor) -> Tensor:
     """Return the index of the least distance among some vehicles, -1 for none: (..., V) -> (...)."""
     least, index = torch.where(among, distance, torch.inf).min(dim=-1)
     return torch.where(least < torch.inf, index, -1)
+
+
+def find_touching(state: State, road: Road) -> Tensor:
+    """Return which bodies overlap which, boolean, (B, N, N), symmetric, nobody with itself."""
+    first, second = select_pairs(state, "all")
+    touching = torch.zeros(*state.x.shape, state.x.shape[1], dtype=torch.bool, device=state.x.device)
+    touching[:, first, second] = touching[:, second, first] = overlaps(state, road, "all")
+    return touching
+
+
+def find_struck(touching: Tensor, off: Tensor, active: Tensor) -> Tensor:
+    """Return which vehicles crash, boolean, (B, N): those that touch the ego or an active one (B, N), which do too.
+
+    So do these where they are `off` the road (B, N). Others pass through each other.
+    """
+    active = active | (torch.arange(active.shape[1], device=active.device) == 0)
+    return (touching & (active[:, :, None] | active[:, None, :])).any(dim=2) | (off & active)

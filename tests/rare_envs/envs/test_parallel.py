@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.utils import parallel_to_aec
 
 import rare_envs
+import samplers
 from rare_envs.control.actions import IDLE
 from rare_envs.control.idm import IDM
 from rare_envs.envs.parallel import AgentsVectorEnv
@@ -279,3 +280,42 @@ def test_a_collision_of_the_ego_ends_all_rows_of_its_scenario() -> None:
     assert not truncated.any()
     assert infos["final_info"]["ego_collision"].tolist() == [True, True, False, False]
     assert infos["final_info"]["measure"][0] == -1.0
+
+
+class Swerving:
+    """An adversary in the cutter's place: it brakes a little, and steers into the ego's way."""
+
+    def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
+        steering = (2.0 * observation[:, 5] - 0.5 * observation[:, 2]).clip(-1, 1)
+        return np.stack([np.full_like(steering, -0.1), steering], axis=1), None
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v0", "rare_envs/CutIn-v1"])
+def test_a_policy_in_traffic_drives_as_an_agent_does(env_id: str) -> None:
+    adversary, coasting = Swerving(), lambda seen: np.zeros((len(seen), 2))
+    problem = rare_envs.DrivingProblem(env_id, ego=coasting, drivers={"cutter": adversary}, horizon=4.0)
+    x = problem.base.sample(400, np.random.default_rng(0))
+    f, env = problem.evaluate(x), rare_envs.parallel_env(env_id, agents=["ego", "cutter"], horizon=4.0)
+    for row in (*np.flatnonzero(f <= 0)[:2], *np.flatnonzero(f > 0)[:2]):
+        seen, infos = env.reset(options={"x": x[row]})
+        while "ego" in env.agents:
+            others = {"cutter": adversary.predict(seen["cutter"][None])[0][0]} if "cutter" in seen else {}
+            seen, _, _, _, infos = env.step({"ego": np.zeros(2), **others})
+        assert infos["ego"]["measure"] == pytest.approx(f[row], abs=1e-4)
+    result, share = samplers.estimate(problem, samplers.MonteCarlo(), max_sim=400, seed=1), np.mean(f <= 0)
+    assert result.given == "Swerving drives the cutter"
+    assert result.p == pytest.approx(share, abs=4.0 * np.sqrt(2 * share * (1 - share) / 400))
+
+
+def test_what_cannot_drive_a_vehicle_of_the_traffic_is_refused() -> None:
+    for drivers, said in (
+        ({"cuter": Swerving()}, r"^Unknown vehicle of the traffic 'cuter' \(did you mean 'cutter'\?\)"),
+        ({"ego": Swerving()}, "^Unknown vehicle of the traffic 'ego'; expected one of 'cutter', 'lead'"),
+        ({"cutter": "idm"}, "^Expected a policy with predict, or its file, to drive the cutter, got idm"),
+        ("cutter=a.zip,cutter=b.zip", "^Expected one driver for each vehicle, got cutter=a.zip,cutter=b.zip"),
+        ("mgale", "^Unknown drivers 'mgale' .*'VEHICLE=POLICY.zip'"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            rare_envs.DrivingProblem("rare_envs/CutIn-v0", drivers=drivers)
+    with pytest.raises(ValueError, match=r"^Expected drivers of all vehicles here: .* as agents, by step\(\)"):
+        rare_envs.parallel_env("cut_in", drivers={"cutter": Swerving()})
