@@ -99,11 +99,7 @@ class Leaf:
         value = self.read(content)
         if value is None:
             return "not known"
-        right = {
-            "equals": lambda: value == self.limit,
-            "at most": lambda: value <= self.limit,
-            "known": lambda: True,
-        }[self.rule]()
+        right = value <= self.limit if self.rule == "at most" else self.rule == "known" or value == self.limit
         return "supported" if right else "not supported"
 
     def read(self, content: Mapping[str, Any]) -> Any:
@@ -421,7 +417,7 @@ def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
             ("The files are those that the run wrote", Leaf(evidence + MANIFEST, "/files_changed", "equals", 0)),
         ],
     }
-    nodes = [
+    nodes: list[dict[str, Any]] = [
         {"id": "G1", "kind": "goal", "text": top, "supports": None},
         {"id": "C1", "kind": "context", "text": f"Covered: {evidence}{COVERAGE}", "supports": "G1"},
         {"id": "A1", "kind": "assumption", "text": "The family of the traffic model is right", "supports": "G1"},
@@ -451,14 +447,14 @@ def _find_upper_limit(result: Mapping[str, Any]) -> float:
 
 def judge_claims(folder: Path, nodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the tree with the status of each node: of leaves by their files, of the others by what is below them."""
-    status: dict[str, Status] = {}
+    status: dict[str, str] = {}
     for node in reversed(nodes):
         below = [status[each["id"]] for each in nodes if each["supports"] == node["id"] and each["id"] in status]
         if node["kind"] == "solution":
             status[node["id"]] = judge_leaf(folder, node)
         elif below:
             worst = [each for each in ("not supported", "not known") if each in below]
-            status[node["id"]] = worst[0] if worst else "supported"  # type: ignore[assignment]
+            status[node["id"]] = worst[0] if worst else "supported"
     return {
         "notation": "GSN Community Standard 3",
         "disclaimer": DISCLAIMER,
