@@ -45,6 +45,7 @@ class Provenance:
     """Origin of a driver: data, training and measured quality.
 
     Example:
+        >>> from agents import Provenance
         >>> Provenance(kind="gail", command="python train.py", data="own recordings", data_licence="CC0").metrics
         {}
     """
@@ -144,6 +145,7 @@ def read_provenance(path: str | PathLike[str]) -> Provenance:
 
     Example:
         >>> from importlib import resources
+        >>> from agents import read_provenance
         >>> read_provenance(resources.files("agents") / "data" / "gail.safetensors").kind
         'gail'
     """

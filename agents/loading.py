@@ -42,10 +42,11 @@ class Ego(Protocol):
     """Policy that drives the ego vehicle: Stable-Baselines3's `predict`, called on whole batches.
 
     Example:
+        >>> import agents, numpy as np
         >>> class Coasting:
         ...     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         ...         return np.zeros((len(observation), 2), np.float32), None
-        >>> isinstance(Coasting(), Ego)
+        >>> isinstance(Coasting(), agents.Ego)
         True
     """
 
@@ -106,6 +107,8 @@ def load_ego(
             something that is no `.zip`.
 
     Example:
+        >>> import numpy as np
+        >>> from agents import load_ego
         >>> load_ego("idm")
         'idm'
         >>> ego = load_ego("imitation")
@@ -289,6 +292,7 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneC
     file is one that `save_driver` wrote. A ValueError says that the name is none of these, or the file no driver.
 
     Example:
+        >>> from agents import load_driver
         >>> load_driver("gail").name
         'gail'
         >>> load_driver("mgail?rules=0").changes is None

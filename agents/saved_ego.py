@@ -53,7 +53,7 @@ class SavedEgo:
     """A Stable-Baselines3 policy read from a file, with its observation statistics if it has any.
 
     Example:
-        >>> import tempfile
+        >>> import tempfile, numpy as np
         >>> from stable_baselines3 import PPO
         >>> from agents import load_ego
         >>> with tempfile.TemporaryDirectory() as folder:

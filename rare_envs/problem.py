@@ -86,7 +86,8 @@ class DrivingProblem:
             fell, and failures may not replay.
 
     Example:
-        >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", ego="idm")
+        >>> import rare_envs
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego="idm")
         >>> x = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]]  # speed of the ego and of its lead [m/s], gap [m]
         >>> problem.evaluate(x).round(2)  # time to collision 30 m / (5 m/s), and a collision
         array([ 6., -1.])
@@ -271,7 +272,8 @@ class DrivingProblem:
             ValueError: As `evaluate`.
 
         Example:
-            >>> problem = DrivingProblem("rare_envs/CutIn-v0")
+            >>> import rare_envs
+            >>> problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0")
             >>> terms = problem.terms([[20.0, 12.0, 12.0, 20.0, 40.0, 3.5]])
             >>> terms.names[terms.least[0]], terms.lowest.round(1).tolist(), terms.f.round(1).tolist()  # [m] and [s]
             ('cutter, 0 to 45 % of the time', [6.6], [1.7])

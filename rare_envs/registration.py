@@ -51,9 +51,9 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
         scenario: The scenario; it is tried on a few draws of its default base distribution.
 
     Example:
-        >>> import dataclasses
-        >>> from rare_envs.scenarios import find_scenario
-        >>> register_scenario("docs/LongCutIn-v0", dataclasses.replace(find_scenario("cut_in"), horizon=20.0))
+        >>> import dataclasses, gymnasium as gym, rare_envs
+        >>> from rare_envs.scenarios import SCENARIOS, find_scenario
+        >>> rare_envs.register_scenario("docs/LongCutIn-v0", dataclasses.replace(find_scenario("cut_in"), horizon=20.0))
         >>> gym.make("docs/LongCutIn-v0").unwrapped.world.clock.seconds
         20.0
         >>> del SCENARIOS["docs/LongCutIn-v0"]
@@ -79,7 +79,8 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
             keyword arguments of `gym.make` for the id.
 
     Example:
-        >>> env = parallel_env("rare_envs/CutIn-v0")
+        >>> import rare_envs
+        >>> env = rare_envs.parallel_env("rare_envs/CutIn-v0")
         >>> env.possible_agents
         ['ego', 'cutter', 'lead']
 
@@ -110,7 +111,8 @@ def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Return `raw_env` behind PettingZoo's usual wrapper, which refuses calls in a wrong order.
 
     Example:
-        >>> game = env("rare_envs/CutIn-v0")
+        >>> import rare_envs
+        >>> game = rare_envs.env("rare_envs/CutIn-v0")
         >>> game.reset(seed=0)
         >>> game.agent_selection, game.state_space.shape
         ('ego', (3, 4))
@@ -133,7 +135,8 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
         The environment, autoreset mode SAME_STEP unless another one is named.
 
     Example:
-        >>> batch = make_batch("rare_envs/CutIn-v0", num_envs=8)
+        >>> import rare_envs
+        >>> batch = rare_envs.make_batch("rare_envs/CutIn-v0", num_envs=8)
         >>> batch.reset(seed=0)[0].shape
         (8, 11)
 

@@ -297,6 +297,7 @@ def as_distribution(base: Any, dim: int | None = None) -> Any:
     Example:
         >>> import numpy as np
         >>> from scipy import stats
+        >>> from samplers import as_distribution
         >>> base = as_distribution([stats.lognorm(0.5), stats.multivariate_normal([1.0, 2.0])])
         >>> base.from_standard_normal(np.zeros((1, 3)))
         array([[1., 1., 2.]])

@@ -106,6 +106,7 @@ class BetaBlock:
 
     Example:
         >>> import numpy as np
+        >>> from samplers.distributions import BetaBlock
         >>> gap = BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=40.0)  # [m]
         >>> gap.from_standard_normal(np.array([[0.0]]))
         array([[20.]])
@@ -281,6 +282,7 @@ class NormalBlock(_GaussianInBase):
 
     Example:
         >>> import numpy as np
+        >>> from samplers.distributions import NormalBlock
         >>> from samplers.proposals import Gaussian
         >>> block = NormalBlock(Gaussian.standard(2), radius=0.5)
         >>> elite = np.array([[3.0, 0.1], [1.0, 0.1]])
@@ -309,6 +311,7 @@ class GaussianBlock(_GaussianInBase):
         Ten points in one place have no covariance; the present one counts as three points.
 
         >>> import numpy as np
+        >>> from samplers.distributions import GaussianBlock
         >>> from samplers.proposals import Gaussian
         >>> elite = np.tile([2.0, 1.0], (10, 1))
         >>> block = GaussianBlock(Gaussian.standard(2)).project(elite, np.full(10, 0.1), alpha=1.0)
@@ -332,6 +335,7 @@ class MixtureBlock(_GaussianInBase):
 
     Example:
         >>> import numpy as np
+        >>> from samplers.distributions import MixtureBlock
         >>> from samplers.proposals import Gaussian
         >>> elite = np.repeat([[4.0, 0.0], [-4.0, 0.0]], 100, axis=0)
         >>> block = MixtureBlock(Gaussian.standard(2), k=2).project(elite, np.full(200, 1 / 200), alpha=1.0)
@@ -369,6 +373,7 @@ class Product(IndependentDistributions):
 
     Example:
         >>> import numpy as np
+        >>> from samplers.distributions import BetaBlock, NormalBlock, Product
         >>> from samplers.proposals import Gaussian
         >>> gap = BetaBlock(alpha=2.0, beta=2.0, low=1.0, high=40.0)
         >>> base = Product((gap, NormalBlock(Gaussian.standard(3))))

@@ -264,6 +264,7 @@ class Terms:
 
     Example:
         >>> import numpy as np
+        >>> from samplers.problem import Terms
         >>> terms = Terms(np.array([1.0, -2.0]), np.array([[1.0, 3.0], [0.5, -2.0]]), np.zeros((2, 2), dtype=int), 0.0)
         >>> terms.least, terms.lowest
         (array([0, 1]), array([ 1., -2.]))
@@ -296,8 +297,8 @@ class TermGradients:
     """Gradients of one term of each point, and what they cost.
 
     Example:
-        >>> import numpy as np
-        >>> TermGradients(np.zeros((2, 3)), cost=6.0).cost
+        >>> import numpy as np, samplers
+        >>> samplers.problem.TermGradients(np.zeros((2, 3)), cost=6.0).cost
         6.0
     """
 

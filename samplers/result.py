@@ -188,8 +188,8 @@ class Estimate(EstimateData, Kept):
             >>> import samplers
             >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
             >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)  # 16 hits
-            >>> [run.n_sim for run in samplers.plan(result.pilot(), target_cov=0.1)]
-            [62400]
+            >>> [(run.n_sim, run.seconds) for run in samplers.plan(result.pilot(seconds=5.0), target_cov=0.1)]
+            [(62400, 31.2)]
         """
         again = self.method.stops_at_target and self.sample is not None
         draws = self.sample.n_units if again and self.sample is not None else None

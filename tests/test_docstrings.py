@@ -18,23 +18,25 @@ import yaml
 from rare_envs.startup import use_one_thread
 
 PACKAGES = ("samplers", "rare_envs", "agents", "training")
+MODULES = [f"samplers.{name}" for name in ("comparison", "distributions", "executors", "problem", "run", "strata")]
+"""Modules that are public and no packages."""
 ROOT = Path(__file__).parents[1]
 WORDS = yaml.safe_load((ROOT / "tests/words.yaml").read_text())
 
 
-def packages_in(name: str) -> Iterator[str]:
-    """Yield the dotted names of a package and of the packages in it."""
+def modules_in(name: str) -> Iterator[str]:
+    """Yield the dotted names of a package, of the packages in it and of MODULES."""
     yield name
     for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f"{name}."):
-        if module.ispkg:
+        if module.ispkg or module.name in MODULES:
             yield module.name
 
 
 def public_objects() -> dict[str, object]:
     """Return classes and functions that packages export, each by its shortest name."""
     found: dict[int, tuple[str, object]] = {}
-    packages = [name for package in PACKAGES for name in packages_in(package)]
-    for package in sorted(packages, key=lambda name: (name.count("."), name)):
+    modules = [name for package in PACKAGES for name in modules_in(package)]
+    for package in sorted(modules, key=lambda name: (name.count("."), name)):
         module = importlib.import_module(package)
         for name in getattr(module, "__all__", ()):
             value = getattr(module, name)
@@ -52,8 +54,9 @@ WITHOUT_EXAMPLE = {
 
 
 def examples_of(value: object, name: str) -> list[doctest.DocTest]:
-    """Return the tests in the docstrings of a public object and of its methods."""
-    space = vars(importlib.import_module(value.__module__))
+    """Return the tests in the docstrings of a public object and of its methods; those at the top can be pasted."""
+    pasted = name.count(".") == 1 or name.startswith("samplers.")
+    space = {} if pasted else vars(importlib.import_module(value.__module__))
     return [test for test in doctest.DocTestFinder().find(value, name, globs=dict(space)) if test.examples]
 
 

@@ -79,6 +79,9 @@ class Retraining:
         ValueError: There is no failure, they are no table of finite numbers, or the share is not between 0 and 1.
 
     Example:
+        >>> import numpy as np
+        >>> from pathlib import Path
+        >>> from training import Retraining
         >>> Retraining(Path("ego.zip"), np.zeros((3, 6)), share=0.25)
         Retraining(ego=PosixPath('ego.zip'), share=0.25)
         >>> Retraining(Path("ego.zip"), np.zeros((0, 6)))
@@ -175,6 +178,7 @@ def train_ego(
     Example:
         >>> import tempfile
         >>> from agents import load_ego
+        >>> from training import train_ego
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = train_ego("rare_envs/CutIn-v0", "a2c", 20, num_envs=4, out=f"{folder}/ego", progress=False)
         ...     print(path.name, load_ego(path).algorithm)

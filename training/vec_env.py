@@ -48,6 +48,8 @@ def sb3_vec_env(
             an argument.
 
     Example:
+        >>> import numpy as np
+        >>> from training import sb3_vec_env
         >>> env = sb3_vec_env("rare_envs/CutIn-v0", num_envs=4, seed=0)
         >>> env.reset().shape, env.action_space
         ((4, 11), Box(-1.0, 1.0, (2,), float32))
@@ -117,6 +119,7 @@ def sb3_agents_env(
         ValueError: An argument is refused.
 
     Example:
+        >>> from training import sb3_agents_env
         >>> env = sb3_agents_env("rare_envs/CutIn-v0", num_scenarios=2, agents=["cutter"], seed=0)
         >>> env.num_envs, len(env.reset())
         (2, 2)

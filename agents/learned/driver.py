@@ -72,6 +72,7 @@ class LearnedDriver:
         ValueError: If limits are out of order, or there are not 404 weights.
 
     Example:
+        >>> import torch
         >>> from agents import load_driver
         >>> driver = load_driver("mgail")
         >>> driver.weights
@@ -209,6 +210,7 @@ class LearnedEgo:
     Simulations call `act`, whatever the environment observes; `predict` is for the observation "lidar".
 
     Example:
+        >>> import numpy as np
         >>> from agents import load_ego
         >>> ego = load_ego("imitation")
         >>> action, state = ego.predict(np.zeros((3, 51), np.float32))
@@ -321,10 +323,10 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
 
     Example:
         >>> import tempfile
-        >>> from agents import load_driver, read_provenance
+        >>> from agents import Provenance, load_driver, read_driver, read_provenance, save_driver
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     origin = Provenance(kind="gail", command="-", data="-", data_licence="CC0")
-        ...     path = save_driver(load_driver("gail"), origin, Path(folder) / "mine.safetensors")
+        ...     path = save_driver(load_driver("gail"), origin, f"{folder}/mine.safetensors")
         ...     print(read_driver(path).name, read_provenance(path).data_licence)
         gail CC0
     """
@@ -355,6 +357,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
 
     Example:
         >>> from importlib import resources
+        >>> from agents import read_driver
         >>> read_driver(resources.files("agents") / "data" / "gail.safetensors").acceleration
         (-8.0, 4.0)
     """

@@ -101,9 +101,10 @@ class IDM:
         ValueError: A parameter is not finite, is negative, or is 0 where it divides or scales.
 
     Example:
-        >>> import math
-        >>> nobody_ahead = Lead(gap=torch.tensor([math.inf]), closing_speed=torch.tensor([0.0]))
-        >>> IDM(desired_speed=20.0).acceleration(torch.tensor([20.0]), nobody_ahead)
+        >>> import rare_envs, torch
+        >>> from rare_envs.control.idm import Lead
+        >>> nobody_ahead = Lead(gap=torch.tensor([torch.inf]), closing_speed=torch.tensor([0.0]))
+        >>> rare_envs.IDM(desired_speed=20.0).acceleration(torch.tensor([20.0]), nobody_ahead)
         tensor([0.])
     """
 

@@ -108,8 +108,9 @@ class HighwayEnvProblem:
             a second.
 
     Example:
+        >>> import numpy as np, rare_envs
         >>> config = {"vehicles_count": 5, "duration": 3}
-        >>> problem = HighwayEnvProblem("highway-fast-v0", config=config, fixed="highway_env")
+        >>> problem = rare_envs.highway_env_problem("highway-fast-v0", config=config, fixed="highway_env")
         >>> problem.space.names
         ('ego_lane', 'speed', 'gap', 'lane', 'noise')
         >>> problem.fixed["ego_speed"]

@@ -158,8 +158,8 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         fixed: Parameters that are held, name to value; they are not in x.
 
     Example:
-        >>> import highway_env
-        >>> env = HighwayEnvScenario(gym.make("highway-fast-v0", config={"vehicles_count": 5}))
+        >>> import gymnasium as gym, highway_env, rare_envs
+        >>> env = rare_envs.HighwayEnvScenario(gym.make("highway-fast-v0", config={"vehicles_count": 5}))
         >>> observation, info = env.reset(seed=0, options={"ego_speed": 30.0, "gap": [12.0, 20.0, 20.0, 20.0]})
         >>> info["scenario"]["gap"], env.space.dim
         (array([12., 20., 20., 20.]), 19)

@@ -304,11 +304,13 @@ def risk(
         RunInterrupted: It was interrupted; the message says what is known.
 
     Example:
-        >>> risk("idm", scenarios=("cut_in", "car_following"))
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.arguments.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
-    """  # noqa: E501 (the example shows a whole message)
+        Leads that brake hard, with so few simulations that there is an upper limit alone:
+
+        >>> import rare_envs
+        >>> found = rare_envs.risk("idm", scenarios="hard_brake", method="mc", max_sim=300, seed=0)
+        >>> found.total.per_million_km, round(found.total.interval_per_million_km[1], -3)
+        (0.0, 23000.0)
+    """
     sites = (sites,) if isinstance(sites, str) else sites
     scenarios = (scenarios,) if isinstance(scenarios, str) else scenarios
     folder, named = None if out is None else Path(out), isinstance(ego, str)

@@ -252,11 +252,17 @@ def load_study(folder: str | Path) -> LoadedStudy:
         BadInput: There is no finished run, or a file of it is damaged.
 
     Example:
-        >>> load_study("runs/nowhere")
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.arguments.BadInput: No finished run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
-    """  # noqa: E501 (the example shows a whole message)
+        >>> import rare_envs
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, method="mc", max_sim=1000, seed=0)
+        >>> with TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder), prepare(question))
+        ...     study = rare_envs.load_study(folder)
+        >>> study.result["n_sim"], study.result["p"] == report.estimate.p
+        (1000, True)
+    """
     path = Path(folder)
     if not all((path / name).is_file() for name in (RESULT, FAILURES)):
         raise BadInput(

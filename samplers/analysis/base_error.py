@@ -72,6 +72,7 @@ class BaseUncertainty(Reported):
     """What is known of p, of a mean over failures or of a ratio, given the events that the base was fitted to.
 
     Example:
+        >>> from samplers.analysis import BaseUncertainty
         >>> found = BaseUncertainty(
         ...     value=7.8e-4, interval=(3.2e-5, 1.9e-2), expected=2e-3, spread=1.4, confidence=0.95,
         ...     value_refits=(2e-4, 1e-3, 3e-3), ess_refits=(150.0, 200.0, 90.0), clusters=17,
@@ -273,6 +274,8 @@ class RefitBand(Reported):
     Fields of shape (k,) belong to the thresholds of the curve.
 
     Example:
+        >>> import numpy as np
+        >>> from samplers.analysis import RefitBand
         >>> ends = {"low": np.array([1e-4, 0.0]), "high": np.array([4e-3, 4e-3]), "spread": np.array([0.9, np.nan])}
         >>> band = RefitBand(**ends, confidence=0.95, n_refits=30, fitted_to="40 events", family="1 component")
         >>> band.to_dict()["spread"]

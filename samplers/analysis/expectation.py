@@ -49,6 +49,7 @@ class FailureExpectation(Reported):
     Example:
         With p = 0.01 and E[h(X) | failure] = 2:
 
+        >>> from samplers.analysis import FailureExpectation
         >>> found = FailureExpectation(value=0.02, interval=(0.01, 0.04), confidence=0.95, cov=0.35, per_failure=2.0)
         >>> found.value / found.per_failure, found.to_dict()["interval"]
         (0.01, [0.01, 0.04])
@@ -77,6 +78,8 @@ def expect_over_failures(
     Example:
         h = 1, 1, 3, 3 at 4 failures among 400 plain draws: (1 + 1 + 3 + 3) / 400.
 
+        >>> import numpy as np
+        >>> from samplers.analysis import WeightedFailures, expect_over_failures
         >>> failures = WeightedFailures(
         ...     x=np.zeros((4, 2)), rows=np.arange(4), has_outcome=np.full(4, True), weights=np.full(4, 1 / 400),
         ...     units=np.arange(4), n_units=400, independent=True, inflation=1.0, total=4)
@@ -124,9 +127,9 @@ def expect_under_refits(
         h = 2 at every failing point, P[x >= 1] under N(0, 1) and under its refits N(-0.2, 1), N(0, 1) and N(0.2, 1):
         2 Phi(-1.2), 2 Phi(-1) and 2 Phi(-0.8).
 
-        >>> import samplers
+        >>> import numpy as np, samplers
         >>> from types import SimpleNamespace
-        >>> from samplers.analysis.weighted import weigh_failures
+        >>> from samplers.analysis import expect_over_failures, expect_under_refits, weigh_failures
         >>> from samplers.proposals import Gaussian
         >>> class FittedNormal(samplers.distributions.StandardNormal):
         ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
@@ -194,7 +197,7 @@ class Exceedance(Curve):
 
     Example:
         >>> import samplers
-        >>> from samplers.analysis import weigh_failures
+        >>> from samplers.analysis import compute_exceedance, weigh_failures
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
         >>> failures = weigh_failures(result)
@@ -264,8 +267,8 @@ def compute_exceedance(
     Example:
         v = x_1 where x_2 > 0, in plain draws from N(0, I): Phi(-1) / 2 = 0.079 and Phi(-2) / 2 = 0.011.
 
-        >>> import samplers
-        >>> from samplers.analysis import weigh_failures
+        >>> import numpy as np, samplers
+        >>> from samplers.analysis import compute_exceedance, weigh_failures
         >>> problem = samplers.FunctionProblem(lambda x: 1.0 - x[:, 0], dim=2)
         >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
         >>> failures = weigh_failures(result)

@@ -55,7 +55,7 @@ class Verdict(Reported):
         >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
         >>> result = samplers.estimate(problem, seed=0, max_sim=6000, confidence=0.9)  # p = 2.3e-4
         >>> print(result.meets(1e-3))
-        passes: p below 0.001 (95 % confidence, upper limit 2.4e-04)
+        passes: p below 0.001 (95 % confidence, upper limit 0.00024)
         >>> bool(result.meets(1e-4)), result.meets(1e-4).decision
         (False, 'fails')
     """
@@ -170,7 +170,8 @@ class Pilot:
         ValueError: It found no failure, or knows p too badly.
 
     Example:
-        >>> Pilot(method="mc", p=1e-3, cov=0.9, n_sim=1200, final_draws=1200)
+        >>> import samplers
+        >>> samplers.analysis.Pilot(method="mc", p=1e-3, cov=0.9, n_sim=1200, final_draws=1200)
         Traceback (most recent call last):
             ...
         ValueError: The pilot of 1,200 simulations has a relative error of 0.9, above 0.5: simulate more for a plan.
@@ -207,6 +208,7 @@ class PlannedRun(Reported):
     """Simulations that a method needs for a coefficient of variation.
 
     Example:
+        >>> from samplers.analysis import PlannedRun
         >>> PlannedRun(method="mc", target_cov=0.1, n_sim=99_900).to_dict()
         {'method': 'mc', 'target_cov': 0.1, 'n_sim': 99900, 'seconds': None}
     """
@@ -221,21 +223,31 @@ class PlannedRun(Reported):
     """Wall time [s], if the pilot's is known."""
 
 
-def plan(pilot: Pilot, target_cov: float) -> tuple[PlannedRun, ...]:
-    """Return what the method of a pilot needs, and plain Monte Carlo.
+def plan(pilot: Any, target_cov: float) -> tuple[PlannedRun, ...]:
+    """Return how many simulations the method of a finished run needs for a precision, and plain Monte Carlo.
 
     Args:
-        pilot: The pilot.
-        target_cov: Target coefficient of variation.
+        pilot: The `Estimate` of the run; or its `pilot(seconds)`, which knows the wall time.
+        target_cov: Target coefficient of variation, above 0.
 
     Raises:
-        ValueError: If the target is not above 0.
+        ValueError: If the target is not above 0, nothing failed in the run, or its c.o.v. is above 0.5.
 
     Example:
-        >>> pilot = Pilot(method="two-stage", p=1e-4, cov=0.02, n_sim=6000, final_draws=2000, seconds=12.0)
-        >>> [(run.method, run.n_sim, run.seconds) for run in plan(pilot, target_cov=0.01)]
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)  # 16 hits
+        >>> [(run.method, run.n_sim) for run in samplers.plan(result, target_cov=0.1)]
+        [('mc', 62400)]
+        >>> pilot = samplers.analysis.Pilot(
+        ...     method="two-stage", p=1e-4, cov=0.02, n_sim=6000, final_draws=2000, seconds=12.0)
+        >>> [(run.method, run.n_sim, run.seconds) for run in samplers.plan(pilot, target_cov=0.01)]
         [('two-stage', 12000, 24.0), ('mc', 99990000, 199980.0)]
     """
+    if not isinstance(pilot, Pilot):
+        if not callable(getattr(pilot, "pilot", None)):
+            raise ValueError(f"Expected the result of samplers.estimate, or its pilot(), got {type(pilot).__name__}.")
+        pilot = pilot.pilot()
     check_number("target_cov", target_cov, 0.0, math.inf)
     factor = (pilot.cov / target_cov) ** 2
     if pilot.final_draws is not None:

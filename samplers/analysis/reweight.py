@@ -69,7 +69,7 @@ class FittedBase(Distribution, Protocol):
     the base.
 
     Example:
-        >>> import samplers
+        >>> import numpy as np, samplers
         >>> from samplers.proposals import Gaussian
         >>> class FittedNormal(samplers.distributions.StandardNormal):
         ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]

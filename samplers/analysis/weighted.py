@@ -278,6 +278,8 @@ class WeightedFailures:
     Example:
         4 failures among 400 plain draws: p = 0.01 with a c.o.v. of sqrt((1 - p) / (400 p)).
 
+        >>> import math, numpy as np
+        >>> from samplers.analysis import WeightedFailures
         >>> failures = WeightedFailures(
         ...     x=np.zeros((4, 2)), rows=np.arange(4), has_outcome=np.full(4, True), weights=np.full(4, 1 / 400),
         ...     units=np.arange(4), n_units=400, independent=True, inflation=1.0, total=4)
@@ -368,10 +370,10 @@ def weigh_failures(estimate: EstimateData, most: int | None = None) -> WeightedF
         ValueError: If there are no weighted points, or none failed.
 
     Example:
-        >>> import samplers
+        >>> import numpy as np, samplers
         >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
         >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=1000)
-        >>> failures = weigh_failures(result)
+        >>> failures = samplers.analysis.weigh_failures(result)
         >>> failures.total == result.failures.total, bool((failures.x >= 2.0).all())
         (True, True)
         >>> bool(np.allclose(failures.weights, 1 / 1000))  # plain draws
@@ -463,11 +465,11 @@ def sum_by_label(estimate: EstimateData, rows: NDArray[np.int64], labels: NDArra
         labels: A word for each, shape (k,).
 
     Example:
-        >>> import samplers
+        >>> import numpy as np, samplers
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
         >>> rows = np.arange(result.failures.total)
-        >>> shares = sum_by_label(result, rows, np.where(rows % 2 == 0, "even", "odd").astype(object))
+        >>> shares = samplers.analysis.sum_by_label(result, rows, np.where(rows % 2 == 0, "even", "odd").astype(object))
         >>> {label: share.points for label, share in shares.items()}
         {'even': 8, 'odd': 8}
     """

@@ -205,7 +205,7 @@ def get_method(name: str, **settings: Any) -> Stepping:
         >>> import samplers
         >>> samplers.methods.get_method("mc", n=5000)
         MonteCarlo(n=5000, batch=10000)
-        >>> samplers.methods.get_method("samplers.methods.cross_entropy:CrossEntropy", n=500).n
+        >>> samplers.methods.get_method("samplers.methods.cross_entropy:CrossEntropy", n_final=500).n_final
         500
     """
     if isinstance(name, str) and ":" in name:
