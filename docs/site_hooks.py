@@ -24,7 +24,7 @@ REMOTE = re.compile(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=\"?https?:|<link
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the files of OUTSIDE as pages."""
     for source, page in OUTSIDE.items():
-        text = (ROOT / source).read_text(encoding="utf-8")
+        text = (ROOT / source).read_text(encoding="utf-8").replace("](../../docs/", "](")
         if not source.endswith(".md"):
             text = f"# {source.capitalize()}\n\n```text\n{text}```\n"
         files.append(File.generated(config, page, content=text))
