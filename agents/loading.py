@@ -87,11 +87,11 @@ def load_ego(
             or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form); "hf:USER/REPOSITORY", such a `.zip` of the
             Hugging Face Hub; `module:function`, a function without arguments that returns an ego (modules in the
             working directory are found); `tcp://host:port` for an ego in another program (docs/egos.md); `process:EGO`,
-            any of these files and functions in a process of its own, which is ended and started anew where the ego
+            any of these files and functions in a process of its own, which is ended and started again if the ego
             hangs or dies; `noisy:EGO`, any ego behind the imperfections of a full stack
             (`agents.imperfect_stack.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None.
-        trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
+        trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs any code in them. Without it
             a file that needs code of its author's is refused, and one to which everybody may write.
         stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it, such as
             `<name>_vecnormalize.pkl` or `vecnormalize.pkl`.

@@ -123,7 +123,7 @@ class OnnxEgo:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Which output is taken as the actions where there are others than a memory, and what masks are."""
+        """Which output is taken as the actions if there are others than a memory, and what masks are."""
         file, taken = self.path.name, [port.name for port in self._outputs]
         others = [port.name for port in self._session.get_outputs() if port.name not in taken]
         chosen = f"the output {taken[0]!r} of {file} is taken as the actions, not {', '.join(map(repr, others))}"

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
 """Advice on a file that was not opened."""
-TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
+TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and any code in it runs"
 """Consequence of trust=True."""
 TRUST_ADVICE = (
     "others may have put something else there: copy it to a folder of your own, or take away their right to write "
@@ -40,7 +40,7 @@ TRUST_ADVICE = (
 def find_origin_risks(*files: Path | None) -> list[str]:
     """Return reasons not to open files; empty if there are none. Files that do not exist give none.
 
-    A file is at risk if everybody may write to it or replace it, in its folder or one above. Where everybody may add
+    A file is at risk if everybody may write to it or replace it, in its folder or one above. If everybody may add
     files but not replace those of others (/tmp), a file of another user is at risk.
     """
     if os.name != "posix":  # others' rights are not in the mode

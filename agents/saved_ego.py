@@ -341,7 +341,7 @@ def _is_rescaled(last: Any, original: Any) -> bool:
 
 
 def _open_observation(header: Mapping[str, Any], name: str) -> Any:
-    """Return the observations in an entry of a file's settings; None where there are none."""
+    """Return the observations in an entry of a file's settings; None if there are none."""
     entry = header.get(name)
     try:
         return open_pickle(base64.b64decode(str(entry[":serialized:"]))) if isinstance(entry, dict) else None

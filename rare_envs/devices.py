@@ -89,7 +89,7 @@ def may_hold(condition: Tensor) -> bool:
 
 
 def are_zero(*values: Tensor) -> bool:
-    """Return whether all of these are 0, where that is soon known and nothing is differentiated with respect to them.
+    """Return whether all of these are 0, if that is soon known and nothing is differentiated with respect to them.
 
     Cars that go straight on in the middle of a lane then need no trigonometry; the result is the same.
     """

@@ -6,11 +6,11 @@ R = lambda p. Both factors are wide, so that errors add up in logarithms:
     sd(log R)^2 = 1 / n + (1 - q) / (q k) + s_p^2 + s^2 + s_site^2,    R exp(-z sd) to R exp(z sd),
 
 for n counted events of which a share q, known from k others, is as the scenario describes; s_p the c.o.v. of the
-estimate of p; s the spread of log p over the refits of the base distribution, with the bias of a fit; s_site the spread
-between sites. Where refits are known, s_p and s are t / z fold: t is the quantile of Student's t for as few clusters of
+estimate of p; s the spread of log p over the refits of the traffic model, with the bias of a fit; s_site the spread
+between sites. If refits are known, s_p and s are t / z fold: t is the quantile of Student's t for as few clusters of
 events.
 
-Where p has an interval of its own, with other distances below and above log p (families of refits, the share that a
+If p has an interval of its own, with other distances below and above log p (families of refits, the share that a
 search may have missed), each side adds up by itself (Zou, Donner, "Construction of confidence limits about effect
 measures: a general approach", Statistics in Medicine 27, 2008):
 
@@ -20,7 +20,7 @@ and in the same way upwards.
 
 Rates of several scenarios are added, with their variances, not their logarithms. As they are wide and skewed, the
 interval is that of the sum of draws from each. Scenarios whose bases were fitted to the same events share that error. A
-scenario whose p is not determined (nothing failed, or its events do not determine p) raises the upper end alone.
+scenario whose p is not determined (nothing failed, or its events do not determine p) raises the upper limit alone.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ SOURCE_FIELDS = ("site", "date", "data", "licence")
 
 
 def read_source(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a record, the provenance of a base, says of its source in `SOURCE_FIELDS`; empty where nothing."""
+    """Return what a record, the provenance of a base, says of its source in `SOURCE_FIELDS`; empty if nothing."""
     source = record.get("source", {})
     inner = source if isinstance(source, Mapping) else {"data": source}
     return {name: str(inner.get(name, record.get(name, "")) or "") for name in SOURCE_FIELDS}
 
 
 def read_site(record: Mapping[str, Any]) -> str:
-    """Return the site of a record, or its data where no site is named; empty if neither is."""
+    """Return the site of a record, or its data if no site is named; empty if neither is."""
     source = read_source(record)
     return source["site"] or source["data"]
 
 
 def explain_no_frequency(record: Mapping[str, Any]) -> str:
-    """Return why the events of a base distribution have no frequency."""
+    """Return why the events of a traffic model have no frequency."""
     source = record.get("source", {})
     reason = source.get("no_frequency") if isinstance(source, Mapping) else None
     return str(reason or "nobody counted how often its events happen")
@@ -99,7 +99,7 @@ class CollisionRate:
     base_log_sd: float = 0.0
     """The same by the events that the base was fitted to; 0 where it is not known."""
     interval: RateInterval | None = None
-    """Interval of p with these errors, of the confidence of the rate; it begins at 0 where p is not determined. None
+    """Interval of p with these errors, of the confidence of the rate; it begins at 0 if p is not determined. None
     for that which the deviations give alike below and above log p."""
     site_log_sd: float = 0.0
     """Standard deviation of log R between sites; 0 for the rate at the site of the base."""
@@ -110,7 +110,7 @@ class CollisionRate:
 
     def __post_init__(self) -> None:
         if self.p <= 0 and self.interval is None:
-            raise ValueError(f"Expected an interval of p = {self.p:g}: nothing else gives its upper end.")
+            raise ValueError(f"Expected an interval of p = {self.p:g}: nothing else gives its upper limit.")
 
     @property
     def per_million_km(self) -> float:
@@ -134,7 +134,7 @@ class CollisionRate:
 
     @property
     def interval_per_million_km(self) -> RateInterval:
-        """Interval of `per_million_km`; from 0 where p is not determined."""
+        """Interval of `per_million_km`; from 0 if p is not determined."""
         counted, z = self.frequency, normal_quantile(self.confidence)
         if counted.count < FEW_EVENTS:
             rng = np.random.default_rng(0)
@@ -166,10 +166,10 @@ class CollisionRate:
         }
 
     def draw(self, base_normal: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Draw rates (n,) from the distribution that the interval describes; of p at its upper end if not determined.
+        """Draw rates (n,) from the distribution that the interval describes; of p at its upper limit if not determined.
 
         Args:
-            base_normal: Standard normal errors of the base distribution, shape (n,), which scenarios may share.
+            base_normal: Standard normal errors of the traffic model, shape (n,), which scenarios may share.
             rng: Source of the other errors.
         """
         n, parts, counted = len(base_normal), self.log_variance, self.frequency
@@ -255,7 +255,7 @@ class TotalRate:
 
     @cached_property
     def interval_per_million_km(self) -> RateInterval:
-        """Interval of `per_million_km`: of the sum of the determined rates, and above it the others' upper ends."""
+        """Interval of `per_million_km`: of the sum of the determined rates, and above it the others' upper limits."""
         if len(self.rates) == 1:
             return self.rates[0].interval_per_million_km
         rng = np.random.default_rng(0)

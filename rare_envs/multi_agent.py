@@ -145,7 +145,7 @@ class AdversaryTerms(NamedTuple):
     """
 
     danger: Tensor
-    """1 - TTC / 4 s where the ego's time to collision is shorter than that."""
+    """1 - TTC / 4 s if the ego's time to collision is shorter than that."""
     collision: Tensor
     """30 in the tick in which the ego collides."""
     comfort: Tensor

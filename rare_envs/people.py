@@ -194,9 +194,9 @@ class ModelCount(NamedTuple):
     high: float
 
     def factor_from(self, low: float, high: float) -> float:
-        """Return how many times it is above the upper end of an interval, or below the lower one (then under 1).
+        """Return how many times it is above the upper limit of an interval, or below the lower one (then under 1).
 
-        1 inside. Where nothing was counted the upper end of its own interval counts: it may be so many times above.
+        1 inside. Where nothing was counted the upper limit of its own interval counts: it may be so many times above.
         """
         p = self.p if self.p > 0 else self.high
         return p / low if p < low else max(p / high, 1.0)
@@ -209,15 +209,15 @@ class EventCalibration:
     Example:
         >>> counts = {"human": {"contacts": ModelCount(1.5e-5, 0.7e-5, 2.8e-5)}}
         >>> found = EventCalibration(event="cut_in", base="us101", per_km=0.26, drivers=counts)
-        >>> f"{found.factor():.1f} times the upper end of people's {found.people('contacts')[1][1]:.1e}"
-        "2.3 times the upper end of people's 6.7e-06"
+        >>> f"{found.factor():.1f} times the upper limit of people's {found.people('contacts')[1][1]:.1e}"
+        "2.3 times the upper limit of people's 6.7e-06"
         >>> found.is_calibrated  # within a factor of 3
         True
     """
 
     event: Event
     base: str
-    """Name of the base distribution."""
+    """Name of the traffic model."""
     per_km: float
     """Frequency of the events."""
     drivers: Mapping[str, Mapping[str, ModelCount]]
@@ -233,7 +233,7 @@ class EventCalibration:
         return self.drivers[driver][outcome].factor_from(*self.people(outcome)[1])
 
     def describe_factor(self, outcome: Outcome = "contacts", driver: str = "human") -> str:
-        """Return the factor, as "7.5 times above people's interval", or that it may be so where nothing was counted."""
+        """Return the factor, as "7.5 times above people's interval", or that it may be so if nothing was counted."""
         factor, count = self.factor(outcome, driver), self.drivers[driver][outcome]
         if factor == 1.0:
             return "inside people's interval"
@@ -257,18 +257,18 @@ class EventCalibration:
 
 @cache
 def _read_calibrations() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
-    """Return what `rare_envs/data/human_calibration.json` holds, by event and base distribution."""
+    """Return what `rare_envs/data/human_calibration.json` holds, by event and traffic model."""
     path = resources.files("rare_envs") / "data" / "human_calibration.json"
     found: Mapping[str, Mapping[str, Mapping[str, Any]]] = json.loads(path.read_text("utf-8"))["events"]
     return found
 
 
 def calibration(event: Event, base: str) -> EventCalibration | None:
-    """Return the calibration of the human driver model in events of one kind; None where nobody measured it.
+    """Return the calibration of the human driver model in events of one kind; None if nobody measured it.
 
     Args:
         event: The kind of event.
-        base: Name of the base distribution, such as "us101".
+        base: Name of the traffic model, such as "us101".
 
     Example:
         >>> calibration("stop", "us101").is_calibrated, calibration("cut_in", "i80").is_calibrated

@@ -77,7 +77,7 @@ class DrivingProblem:
         needs: What the ego needs of the world, and says about itself.
         world: The simulation.
         driver: The ego as a Driver.
-        space: Names, units, bounds and base distribution of x.
+        space: Names, units, bounds and traffic model of x.
         dim: Number of columns of x.
         column_names: Their names, for the tables of results.
         base: Distribution of x in ordinary traffic.
@@ -118,7 +118,7 @@ class DrivingProblem:
                 knows, such as "ppo.zip" (its further arguments: `ego=agents.load_ego("ppo.zip", stats=...)`).
             measure: The safety measure: a name, an object or a function, see
                 `rare_envs.measures.find_measure`.
-            base: Base distribution of x; None takes the environment's default ("us101").
+            base: Traffic model of x; None takes the environment's default ("us101").
             noise: How the randomness of learned drivers is treated: True, it is part of x, standard normal columns
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
                 actions. Scripts and most egos have none (policies act by their means), so there the three agree; the
@@ -199,7 +199,7 @@ class DrivingProblem:
 
     @property
     def plain_draws(self) -> int:
-        """Rollouts that are made of a stratum in which nothing failed, for its upper end: a matter of seconds."""
+        """Rollouts that are made of a stratum in which nothing failed, for its upper limit: a matter of seconds."""
         if is_compiled(self.world, self.driver):
             return COMPILED_DRAWS
         return TORCH_DRAWS if isinstance(self.driver, HumanDriver | ReferenceDriver) else 0
@@ -261,7 +261,7 @@ class DrivingProblem:
     def terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> EpisodeTerms:
         """Simulate, and tell apart the terms of which f is the least, one of each vehicle say.
 
-        Where f <= gamma means a collision, they are distances to the vehicles, early and late in the episode, whatever
+        If f <= gamma means a collision, they are distances to the vehicles, early and late in the episode, for any
         the measure; see `rare_envs.measures.registry.find_order`.
 
         Args:
@@ -290,7 +290,7 @@ class DrivingProblem:
 
     @cached_property
     def gradient(self) -> Differentiator | None:
-        """Gradients of the terms: `gradient(x, term, ticks)`; None where measure or drivers have none."""
+        """Gradients of the terms: `gradient(x, term, ticks)`; None if measure or drivers have none."""
         x = self.base.sample(1, np.random.default_rng(0))
         world, driver = self.on_cpu()  # which has gradients of the few rollouts that methods ask for at once sooner
         return find_differentiator(world, driver, self.needs.queries_policy, x)
@@ -360,7 +360,7 @@ class DrivingProblem:
         return f
 
     def _simulate_compiled(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return f of scenarios x (n, d), NaN where it is not known; None where torch has to simulate."""
+        """Return f of scenarios x (n, d), NaN where it is not known; None if torch has to simulate."""
         if self._core == "torch":
             return None
         try:
@@ -417,7 +417,7 @@ class DrivingProblem:
         return end._replace(measure_state=measure.settle(end.measure_state, at, again.f.to(at.device)))
 
     def _replay(self, world: World, rows: Tensor) -> Episode | None:
-        """Return the episodes of x (B, d) on a GPU; None where the CPU has to ask a policy, or to tell how it fails."""
+        """Return the episodes of x (B, d) on a GPU; None if the CPU has to ask a policy, or to tell how it fails."""
         known = self._recorded
         if world.policies:
             return None

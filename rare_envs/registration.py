@@ -48,7 +48,7 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
 
     Args:
         env_id: In Gymnasium's form, such as "my_namespace/Overtaking-v0".
-        scenario: The scenario; it is tried on a few draws of its default base distribution.
+        scenario: The scenario; it is tried on a few draws of its default traffic model.
 
     Example:
         >>> import dataclasses, gymnasium as gym, rare_envs

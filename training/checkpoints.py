@@ -47,7 +47,7 @@ def read_checkpoint(path: Path, entries: Sequence[str], device: torch.device | s
         if not state.keys() >= {*entries}:
             raise ValueError("it lacks some of the state")
     except Exception as error:  # a damaged file can raise anything at all
-        raise ValueError(f"Cannot take up {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
+        raise ValueError(f"Cannot resume {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
     return state
 
 
@@ -77,7 +77,7 @@ def load_checkpoint(path: Path, arguments: Mapping[str, Any]) -> dict[str, Any]:
     try:
         begun = dict(json.loads(state["arguments"]))
     except (ValueError, TypeError) as error:
-        raise ValueError(f"Cannot take up {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
+        raise ValueError(f"Cannot resume {str(path)!r}: it is damaged or no checkpoint; remove it.") from error
     if version != CHECKPOINT_FORMAT:
         raise ValueError(f"{str(path)!r} is a checkpoint of another version of this program; remove it.")
     given = json.loads(json.dumps(arguments))

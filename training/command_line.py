@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import typer
 
-RunFolderOption = Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")]
+RunFolderOption = Annotated[Path, typer.Option(help="Folder; a training that was stopped in it continues.")]
 LocationOption = Annotated[str | None, typer.Option(help="Location, where an NGSIM file has several.")]
 
 

@@ -161,7 +161,7 @@ def train_ego(
         checkpoint_interval: Time between checkpoints [s]; the last one is removed when the ego is saved.
         retraining: An ego to go on from, in place of a new one, and failures of the one environment, which are mixed
             into the scenarios.
-        even_strata: Draw the strata of base distributions equally often, whatever their shares: an ego that meets a
+        even_strata: Draw the strata of traffic models equally often, regardless of their shares: an ego that meets a
             cutter who does not look once in 6,000 episodes does not learn to expect one.
         **make_kwargs: Keyword arguments of `gym.make_vec` for this environment; `device` places networks that
             see pictures too.

@@ -36,7 +36,7 @@ def sb3_vec_env(
         seed: Seed of the first reset; an algorithm's own seed replaces it.
         discrete: Offer the rows of `rare_envs.control.actions.DISCRETE_ACTIONS` as a `Discrete` action
             space, for algorithms such as DQN; an environment with `action="meta"` has one already.
-        even_strata: Draw the strata of a base distribution equally often, whatever their shares, so that a policy
+        even_strata: Draw the strata of a traffic model equally often, regardless of their shares, so that a policy
             meets the rare ones: of the cutters of CutIn-v1 one in 6,000 does not look.
         **make_kwargs: Keyword arguments of `gym.make` for these environments.
 

@@ -207,7 +207,7 @@ class LearnedDriver:
 class LearnedEgo:
     """A learned driver as ego: a Driver that acts by its mean actions and has no memory.
 
-    Simulations call `act`, whatever the environment observes; `predict` is for the observation "lidar".
+    Simulations call `act`, with any observation of the environment; `predict` is for the observation "lidar".
 
     Example:
         >>> import numpy as np

@@ -275,7 +275,7 @@ class LaneChanges:
     Begin. The hazard of a change to a side is exp(coefficients . `COVARIATES`) [1/s] while there is a lane (a body was
     seen beyond the line within `remembered`), a gap (`accepted_gap` is left after `accepted_time`, ahead and behind)
     and speed enough. It uses up an exponentially distributed patience of that side; at 0 the change begins, with a
-    duration of its own. Who at the first moment will reach the line within `foresight`, where there is a lane and a
+    duration of its own. Who at the first moment will reach the line within `foresight`, if there is a lane and a
     gap, or within `near` anyway, is changing already: the course is taken up there.
 
     Course. The distance left is D (1 - 3 s^2 + 2 s^3) with s = t / `duration`; errors are corrected as by a critically

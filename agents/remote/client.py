@@ -138,7 +138,7 @@ class ServerLink:
             self._look()
 
     def _count_received(self) -> int:
-        """Return how many bytes have come over the connection; 0 where the system does not count them."""
+        """Return how many bytes have come over the connection; 0 if the system does not count them."""
         if self._connection is None:
             return 0
         told = self._connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED.stop)

@@ -220,7 +220,7 @@ class HumanDriverModel:
     """Angle between a glance and the road [deg], by which `seen_expansion_rate` says when looming breaks it off. Beyond
     90 degrees none is broken off. In-car displays are at 20 to 40 degrees, this is the middle of that, assumed for
     every glance. It hardly matters: without the headway rule 2 to 3 of 100,000 stops of the lead end in contact at 0,
-    30 and 90 degrees alike, and 1,300 do where no glance is broken off."""
+    30 and 90 degrees alike, and 1,300 do if no glance is broken off."""
     headway_rule: bool = True
     """Whether a glance is no longer than the headway (gap over own speed) at its beginning less the reaction time.
     That self-paced occlusion grows one to one with headway is Pekkanen et al.'s (2017, in a simulator), that it is

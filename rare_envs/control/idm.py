@@ -98,7 +98,7 @@ class IDM:
     their code.
 
     Raises:
-        ValueError: A parameter is not finite, is negative, or is 0 where it divides or scales.
+        ValueError: A parameter is not finite, is negative, or is 0 and divides or scales.
 
     Example:
         >>> import rare_envs, torch

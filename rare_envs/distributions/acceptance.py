@@ -5,8 +5,8 @@ mixture m is multiplied by the probability A that a driver who looks accepts the
 
     p(x) = m(x) A(n) / Z,    A(n) = 1 / (1 + (n / b)^4),    n = dv^2 / (2 (gap - T dv)),    T = 1 s,
 
-with dv the closing speed of the vehicle behind and n the deceleration that it needs if it answers after T; A is 1 where
-dv <= 0, and 0 where gap <= T dv. b is fitted (`training.fit.acceptance`); the power and T are assumed. A depends on
+with dv the closing speed of the vehicle behind and n the deceleration that it needs if it answers after T; A is 1 if
+dv <= 0, and 0 if gap <= T dv. b is fitted (`training.fit.acceptance`); the power and T are assumed. A depends on
 closing speed and gap alone, so that with these two first in the order all other conditionals are those of m.
 """
 
@@ -118,12 +118,12 @@ class AcceptedGaps:
 
     @cached_property
     def low(self) -> FloatArray:
-        """Lower ends of the box of x, shape (d,)."""
+        """Lower bounds of the box of x, shape (d,)."""
         return self._with_range(self.mixture.low, self.mixture.coordinates.within[0].least)
 
     @cached_property
     def high(self) -> FloatArray:
-        """Upper ends, shape (d,)."""
+        """Upper bounds, shape (d,)."""
         return self._with_range(self.mixture.high, self.mixture.coordinates.within[0].most)
 
     @property
@@ -132,7 +132,7 @@ class AcceptedGaps:
         return self._closing.log_total
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
-        """Return the log density, (n, d) -> (n,); -inf outside the box, and where nobody accepts."""
+        """Return the log density, (n, d) -> (n,); -inf outside the box, and if nobody accepts."""
         points = self.mixture.read_rows("x", x)
         inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
         z = self._to_closing(points)

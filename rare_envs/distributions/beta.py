@@ -23,8 +23,8 @@ class BetaDistribution:
     Args:
         alpha: First shape parameters, shape (d,).
         beta: Second ones.
-        low: Lower ends of the ranges.
-        high: Upper ends.
+        low: Lower bounds of the ranges.
+        high: Upper bounds.
 
     Raises:
         ValueError: If the shapes differ, a shape parameter is not positive, or a range is empty.

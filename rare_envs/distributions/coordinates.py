@@ -63,8 +63,8 @@ class Coordinates:
     the determinant of its Jacobian is a product, and the range of a coordinate follows from the earlier columns.
 
     Args:
-        low: Lower ends of the box of x, shape (d,), finite.
-        high: Upper ends, shape (d,).
+        low: Lower bounds of the box of x, shape (d,), finite.
+        high: Upper bounds, shape (d,).
         kinds: Kind of the coordinate of each column of x, d of them; plain ones by default.
         names: Names of the columns of x; needed where a coordinate or the order names one.
         order: Names of the columns in the order of the coordinates; the order of x by default.

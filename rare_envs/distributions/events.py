@@ -45,7 +45,7 @@ def require_text(what: str, value: object) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class EventFrequency:
-    """Events counted in recordings, and the share of them that the base distribution stands for.
+    """Events counted in recordings, and the share of them that the traffic model stands for.
 
     With n events counted in T hours, and a share s of them estimated from m events (k = s m of which had it):
 
@@ -78,7 +78,7 @@ class EventFrequency:
     km: float
     """Vehicle-kilometres in which they were counted."""
     share: float = 1.0
-    """Share of the counted events that are as the base distribution's."""
+    """Share of the counted events that are as the traffic model's."""
     share_events: int | None = None
     """Events of which the share is the share, m; None if it is known without error."""
     definition: str

@@ -42,7 +42,7 @@ def read_distribution(data: Mapping[str, Any]) -> FileDistribution:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedDistribution:
-    """A base distribution fitted to events, with refits to resampled events: how far the events determine it.
+    """A traffic model fitted to events, with refits to resampled events: how far the events determine it.
 
     Density, sampling and maps are those of `distribution`.
 
@@ -67,13 +67,13 @@ class FittedDistribution:
     family: str
     """Family of distributions in words, such as "1 component, log gaps"."""
     frequency: EventFrequency | None = None
-    """How often the events happen; None where nobody counted."""
+    """How often the events happen; None if nobody counted."""
     checks: tuple[PredictiveCheck, ...] = ()
     """Recorded against expected counts."""
     record: Mapping[str, Any] = field(default_factory=dict)
     """Provenance: sources, licence, site, date, coordinates, criteria of the selection; `provenance` of a file."""
     siblings: Callable[[str], Distribution] | None = field(default=None, repr=False)
-    """Loader of other base distributions of the same scenario, by name or file."""
+    """Loader of other traffic models of the same scenario, by name or file."""
     fitted_to: str = field(init=False, repr=False)
     """The events in words, such as "38 + 15 events of 17 scenes"."""
 
@@ -101,12 +101,12 @@ class FittedDistribution:
 
     @property
     def low(self) -> FloatArray:
-        """Lower ends of the box, shape (d,)."""
+        """Lower bounds of the box, shape (d,)."""
         return cast(FloatArray, cast(Any, self.distribution).low)
 
     @property
     def high(self) -> FloatArray:
-        """Upper ends of the box, shape (d,)."""
+        """Upper bounds of the box, shape (d,)."""
         return cast(FloatArray, cast(Any, self.distribution).high)
 
     @property
@@ -194,13 +194,13 @@ class FittedDistribution:
         return replace(self, refits=tuple(self.refits[i] for i in chosen)).ensemble()
 
     def sibling(self, name: str) -> Distribution:
-        """Return another base distribution of the same scenario, by name or file.
+        """Return another traffic model of the same scenario, by name or file.
 
         Raises:
             ValueError: There is no such one, or this distribution was made by hand and knows none.
         """
         if self.siblings is None:
-            raise ValueError(f"This base distribution was not loaded by name and knows no {name!r}; give an object.")
+            raise ValueError(f"This traffic model was not loaded by name and knows no {name!r}; give an object.")
         return self.siblings(name)
 
     def to_dict(self) -> dict[str, Any]:
@@ -229,9 +229,9 @@ class FittedDistribution:
         Args:
             data: Keys of the distribution (see `TruncatedGaussianMixture.from_dict`), and `events`, `family`, and if
                 wanted `refits`, `frequency`, `checks` and `provenance`. A refit is an object with weights, means and
-                covariances (alpha and beta, where the base has these), in the coordinates of the base or with
+                covariances (alpha and beta, if the base has these), in the coordinates of the base or with
                 `coordinates` and `order` of its own.
-            siblings: Loader of other base distributions of the same scenario.
+            siblings: Loader of other traffic models of the same scenario.
 
         Raises:
             ValueError: A key is missing or its value is not valid.
@@ -311,7 +311,7 @@ def _join_with(distributions: Sequence[Distribution], replacement: Distribution)
 
 
 def _join_sibling(distributions: Sequence[Distribution], fitted: FittedDistribution, name: str) -> Distribution:
-    """Return distributions as one with another base distribution in place of the fitted one."""
+    """Return distributions as one with another traffic model in place of the fitted one."""
     return _join_with(distributions, fitted.sibling(name))
 
 

@@ -1,4 +1,4 @@
-"""Gaussian mixtures in a box: the base distributions of most scenarios, exact in every direction.
+"""Gaussian mixtures in a box: the traffic models of most scenarios, exact in every direction.
 
 A mixture is taken one coordinate at a time, each conditional cut to its range. Density, draws and the maps to and from
 standard normal space use one-dimensional normal distribution functions only, so they stay accurate far from the bulk.
@@ -212,8 +212,8 @@ class TruncatedGaussianMixture(MappedMixture):
         weights: Component weights, shape (K,), positive, sum 1.
         means: Component means, shape (K, d), in the order of the coordinates.
         covariances: Component covariances, shape (K, d, d), symmetric positive definite, in the same order.
-        low: Lower ends of the box, shape (d,), finite.
-        high: Upper ends of the box, shape (d,), finite, above `low`.
+        low: Lower bounds of the box, shape (d,), finite.
+        high: Upper bounds of the box, shape (d,), finite, above `low`.
         coordinates: Coordinates of x, their order, and the box unless `low` and `high` are given; x itself by default.
 
     Raises:
@@ -419,7 +419,7 @@ def pool_mixtures(mixtures: Sequence[Distribution]) -> TruncatedGaussianMixture 
 
     Those of the same coordinates become one mixture with the components of all, whose conditionals are cut to the box
     as a whole, not each mixture's by itself: its density is the mean of theirs up to factors 1 / (1 - mass outside the
-    box). Where the coordinates differ, the columns are taken in an order that serves all.
+    box). If the coordinates differ, the columns are taken in an order that serves all.
     """
     groups: dict[str, list[TruncatedGaussianMixture]] = {}
     for i, each in enumerate(mixtures):

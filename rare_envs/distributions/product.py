@@ -94,12 +94,12 @@ class ProductDistribution:
 
     @property
     def low(self) -> FloatArray:
-        """Lower ends of the box, shape (d,)."""
+        """Lower bounds of the box, shape (d,)."""
         return np.concatenate([box_of(block)[0] for block in self.blocks])
 
     @property
     def high(self) -> FloatArray:
-        """Upper ends of the box, shape (d,)."""
+        """Upper bounds of the box, shape (d,)."""
         return np.concatenate([box_of(block)[1] for block in self.blocks])
 
     @property

@@ -94,9 +94,9 @@ class Parameter:
     unit: str
     """Empty for a number without one."""
     low: float
-    """Lower end of the range."""
+    """Lower bound of the range."""
     high: float
-    """Upper end of the range."""
+    """Upper bound of the range."""
     meaning: str
     """In words."""
     size: int = 1
@@ -110,7 +110,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScenarioSpace:
-    """The parameters of a scenario in the order of x, and their base distribution.
+    """The parameters of a scenario in the order of x, and their distribution, the traffic model.
 
     Example:
         >>> import gymnasium as gym, rare_envs
@@ -136,9 +136,9 @@ class ScenarioSpace:
     sizes: tuple[int, ...] = field(init=False)
     """Columns of x that each takes."""
     low: FloatArray = field(init=False)
-    """Lower ends of the allowed ranges, one for each column of x, shape (d,)."""
+    """Lower bounds of the allowed ranges, one for each column of x, shape (d,)."""
     high: FloatArray = field(init=False)
-    """Upper ends, shape (d,)."""
+    """Upper bounds, shape (d,)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", tuple(self.parameters))
@@ -160,11 +160,11 @@ class ScenarioSpace:
         return tuple(p.name if p.size == 1 else f"{p.name}[{k}]" for p in self.parameters for k in range(p.size))
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw independent scenarios from the base distribution, shape (n, d)."""
+        """Draw independent scenarios from the traffic model, shape (n, d)."""
         return self.base.sample(n, rng)
 
     def log_prob(self, x: FloatArray) -> FloatArray:
-        """Return the log density of the base distribution, (n, d) -> (n,)."""
+        """Return the log density of the traffic model, (n, d) -> (n,)."""
         return self.base.log_prob(x)
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
@@ -245,7 +245,7 @@ class ScenarioSpace:
         rng: np.random.Generator,
         draw: Callable[[int, np.random.Generator], FloatArray] | None = None,
     ) -> FloatArray:
-        """Return scenarios with some parameters given and the others drawn from the base distribution.
+        """Return scenarios with some parameters given and the others drawn from the traffic model.
 
         The given values replace drawn ones: the rest is not conditioned on them.
 

@@ -37,9 +37,9 @@ class CutNormals:
     """
 
     low: FloatArray
-    """Lower ends, (d,), -inf for none."""
+    """Lower bounds, (d,), -inf for none."""
     high: FloatArray
-    """Upper ends, (d,)."""
+    """Upper bounds, (d,)."""
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
@@ -151,12 +151,12 @@ class StratifiedDistribution:
 
     @property
     def low(self) -> FloatArray:
-        """Lower ends of the box, shape (d,)."""
+        """Lower bounds of the box, shape (d,)."""
         return np.asarray(np.min([box_of(each.base)[0] for each in self.strata], axis=0))
 
     @property
     def high(self) -> FloatArray:
-        """Upper ends of the box, shape (d,)."""
+        """Upper bounds of the box, shape (d,)."""
         return np.asarray(np.max([box_of(each.base)[1] for each in self.strata], axis=0))
 
     def log_prob(self, x: ArrayLike) -> FloatArray:

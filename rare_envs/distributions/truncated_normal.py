@@ -244,7 +244,7 @@ def cut_quantile(a: FloatArray, b: FloatArray, log_below: FloatArray, log_above:
 def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
     """Return a component index per column with probability proportional to exp(score), from uniform v.
 
-    Where all scores are minus infinity, it is the last one.
+    If all scores are minus infinity, it is the last one.
     """
     total = log_sum(score)
     cumulative = np.cumsum(np.exp(score - np.where(total == -np.inf, 0.0, total)), axis=0)
@@ -259,7 +259,7 @@ def log_sum(values: FloatArray) -> FloatArray:
 
 
 def _highest(values: FloatArray) -> FloatArray:
-    """Return the largest over components, or 0 where that is not finite, (K, n) -> (n,)."""
+    """Return the largest over components, or 0 if that is not finite, (K, n) -> (n,)."""
     top = values.max(axis=0)
     return np.where(np.isfinite(top), top, 0.0)
 

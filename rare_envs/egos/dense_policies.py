@@ -181,7 +181,7 @@ def _refuse_changed(part: Any) -> None:
 
 
 def _read_statistics(normalise: Any) -> tuple[Any, Any, float] | None:
-    """Return mean, deviation and bound of observations by `VecNormalize`'s method; None where it leaves them."""
+    """Return mean, deviation and bound of observations by `VecNormalize`'s method; None if it leaves them."""
     statistics: Any = getattr(normalise, "__self__", None)  # of a function, none
     module = sys.modules.get(f"{SB3}.common.vec_env.vec_normalize")
     if module is None or type(statistics) is not module.VecNormalize or normalise.__name__ != "normalize_obs":

@@ -239,7 +239,7 @@ class HumanDriver:
         return _Sight(ahead, on_left, on_right, speed, felt), since
 
     def _look_away(self, memory: _HumanMemory, late: _Sight) -> _Glance:
-        """Return the glance that is due: one is begun where nothing comes nearer, and looming ends it.
+        """Return the glance that is due: one is begun if nothing comes nearer, and looming ends it.
 
         Of what there is to see, whether the driver looks or not: it is seen from the corner of the eye.
         """

@@ -155,7 +155,7 @@ def choose_observation(needs: EgoNeeds, vehicles: int) -> str:
 
 
 def choose_action(action_space: Any, observation: str) -> str:
-    """Return the kind of actions where nobody names it; with HighwayEnv's kinematics its policies' fit two kinds."""
+    """Return the kind of actions if nobody names it; with HighwayEnv's kinematics its policies' fit two kinds."""
     if "kinematics" not in observation.split("+"):
         return "continuous"
     if isinstance(action_space, spaces.Box) and action_space.shape == (2,):

@@ -67,7 +67,7 @@ def make_scene(episode: Episode) -> Any:
 
 
 def find_crashed(episode: Episode, row: int = 0) -> Collection[int]:
-    """Return the ego and the vehicles that it touches, in a row; nobody where it has not collided."""
+    """Return the ego and the vehicles that it touches, in a row; nobody if it has not collided."""
     if not bool(episode.collided[row]):
         return ()
     state = State(*(field[row : row + 1] for field in episode.state))

@@ -159,7 +159,7 @@ def list_tensors(value: Any) -> list[Tensor]:
 
 
 def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return rows of an observation as objects, None where the mask (B,) is not set: `final_obs` of Gymnasium."""
+    """Return rows of an observation as objects, None if the mask (B,) is not set: `final_obs` of Gymnasium."""
     rows = np.full(len(mask), None, dtype=object)
     for row in np.flatnonzero(mask):
         rows[row] = map_kinds(lambda part, row=row: part[row].copy(), observation)

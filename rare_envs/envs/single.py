@@ -113,7 +113,7 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
         Args:
             seed: Seeds the draw of the scenario.
             options: Scenario parameters by name, or {"x": vector} for all of them. What is not given is drawn: a
-                whole x comes from the base distribution, then the given parameters replace theirs.
+                whole x comes from the traffic model, then the given parameters replace theirs.
 
         Returns:
             Observation and info.

@@ -42,7 +42,7 @@ from rare_envs.traffic.state import map_tensors
 class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """`DrivingEnv` for a whole batch, with Gymnasium's autoreset modes, SAME_STEP unless another one is asked for.
 
-    With SAME_STEP an episode that ends is replaced within the step by one drawn from the base distribution; its last
+    With SAME_STEP an episode that ends is replaced within the step by one drawn from the traffic model; its last
     observation and info are in `infos["final_obs"]` and `infos["final_info"]`. With NEXT_STEP the next step replaces
     it, whose action does not count and whose reward is 0. With DISABLED a `reset` with options={"reset_mask": rows}
     does. One generator draws for the whole batch, but for episodes that were given seeds of their own.
@@ -119,7 +119,7 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
 
     @property
     def space(self) -> ScenarioSpace:
-        """The scenario space; from the base distribution of one that is set the next episodes are drawn."""
+        """The scenario space; from the traffic model of one that is set the next episodes are drawn."""
         return self._space
 
     @space.setter

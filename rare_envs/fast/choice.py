@@ -82,7 +82,7 @@ def is_compiled(world: World, driver: Driver) -> bool:
 
 
 def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return f of scenarios x (B, d), NaN where a policy's outputs are not finite; NotCompiled for others."""
+    """Return f of scenarios x (B, d), NaN if a policy's outputs are not finite; NotCompiled for others."""
     script, ego, compiled = find_script(world), read_ego(world, driver), import_compiler()
     with torch.inference_mode():
         state = world.scenario.initial(torch.from_numpy(x).float())
@@ -173,7 +173,7 @@ class ScriptedStep:
 
 
 def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
-    """Return the compiled steps of a world; None where torch has to carry them out, a ValueError with "numba"."""
+    """Return the compiled steps of a world; None if torch has to carry them out, a ValueError with "numba"."""
     check_name("core", core, CORES)
     if core == "torch":
         return None

@@ -146,13 +146,13 @@ def clip(value: float, low: float, high: float) -> float:
 
 @compiled
 def at_least(value: float, low: float) -> float:
-    """Return the larger of both, NaN where `value` is, as torch does; `max` would hide it."""
+    """Return the larger of both, NaN if `value` is, as torch does; `max` would hide it."""
     return low if value < low else value
 
 
 @compiled
 def at_most(value: float, high: float) -> float:
-    """Return the smaller of both, NaN where `value` is."""
+    """Return the smaller of both, NaN if `value` is."""
     return high if value > high else value
 
 

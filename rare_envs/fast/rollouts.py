@@ -68,7 +68,7 @@ def numbers_of(script: str, cutter: CutterModel, road: Road, dt: float) -> Scrip
 
 
 def drive(numbers: ScriptNumbers, state: State, ego: IDM | DensePolicy, ticks: int) -> NDArray[np.float64]:
-    """Return f (B,) of scenarios from their state at time 0, NaN where a policy's outputs are not finite."""
+    """Return f (B,) of scenarios from their state at time 0, NaN if a policy's outputs are not finite."""
     start, vehicles, f = stack_state(state), state.x.shape[1], np.full(len(state.x), np.inf, dtype=np.float32)
     table = make_table(start, vehicles, min(ROWS, max(len(f), 1)) if isinstance(ego, IDM) else LANES)
     if isinstance(ego, IDM):

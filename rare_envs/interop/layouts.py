@@ -1,6 +1,6 @@
 """Parameters of HighwayEnv's environments: highway, merge, intersection, roundabout; and their values put into a scene.
 
-Where HighwayEnv draws, the distributions are those from which it draws; docs/highway_env.md has the tables.
+If HighwayEnv draws, the distributions are those from which it draws; docs/highway_env.md has the tables.
 """
 
 from collections import ChainMap
@@ -39,7 +39,7 @@ class Group(NamedTuple):
     parameters: tuple[Parameter, ...]
     distribution: Distribution
     usual: float | None = None
-    """HighwayEnv's value; None where it draws."""
+    """HighwayEnv's value; None if it draws."""
 
 
 class Layout(NamedTuple):
@@ -256,7 +256,7 @@ def _highway_groups(env: Any, vehicles: int) -> list[Group]:
             "expected a lower density."
         )
     speed = Parameter("speed", *SPEED, "initial and desired speed, the nearest vehicle first", vehicles)
-    gap = Parameter("gap", "m", 0.0, 300.0, "along the road from the vehicle before, whatever its lane", vehicles)
+    gap = Parameter("gap", "m", 0.0, 300.0, "along the road from the vehicle before, in any lane", vehicles)
     first, lane = env.config["initial_lane_id"], ("", 0.0, lanes)
     none, every = np.zeros(vehicles), np.full(vehicles, lanes)
     return [
@@ -285,7 +285,7 @@ def _arrange_highway(env: Any, values: Values) -> None:
 
 def _merge_groups(env: Any, vehicles: int) -> list[Group]:
     slowest, fastest = (30.0, 28.0, 30.5), (32.0, 30.0, 32.5)
-    ahead = "from the ego to the first vehicle ahead, whatever its lane"
+    ahead = "from the ego to the first vehicle ahead, in any lane"
     return [
         uniform("ego_speed", SPEED, 25.0, 35.0, "initial speed of the ego", 30.0),
         uniform("speed", SPEED, slowest, fastest, "of the first, the second ahead, and the one behind"),

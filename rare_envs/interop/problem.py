@@ -98,7 +98,7 @@ class HighwayEnvProblem:
         env_id: The environment's id.
         ego: What was given; in another process its policy alone.
         config: HighwayEnv's configuration as it was given.
-        space: Names, units, bounds and base distribution of x.
+        space: Names, units, bounds and traffic model of x.
         dim: Number of columns of x.
         column_names: Their names, for the tables of results.
         base: Distribution of x.

@@ -143,7 +143,7 @@ HIGHWAY_ENV = "highway_env."
 
 
 class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """A HighwayEnv environment with scenario parameters as reset options, and a base distribution over them.
+    """A HighwayEnv environment with scenario parameters as reset options, and a traffic model over them.
 
     `reset(options={"gap": [20.0, 15.0, 30.0, 30.0], "ego_speed": 28.0})` sets these; what is not given is drawn from
     `space.base`, and `options={"x": vector}` sets all. Everything after reset is HighwayEnv's own, and a function of x
@@ -154,7 +154,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
     if the ego crashed, else the least measure over all simulation steps, not only those at which the policy is queried.
 
     Attributes:
-        space: Names, units, bounds and base distribution of x.
+        space: Names, units, bounds and traffic model of x.
         fixed: Parameters that are held, name to value; they are not in x.
 
     Example:

@@ -18,7 +18,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State, map_le
 GAP_MIN = 0.01
 """Gaps are floored here [m] so that only a collision, never a narrow escape, comes to 0 or less."""
 GAP_MAX = 1e6
-"""And cut here [m], where there is no lead."""
+"""And cut here [m], if there is no lead."""
 STILL = 1e-4
 """Speeds in a denominator are floored here [m/s], far below gap / TTC_MAX, so no value under the cap changes."""
 COLLISION = -1.0
@@ -53,7 +53,7 @@ class Moment(NamedTuple):
     dt: float = 0.1
     """Tick [s]."""
     evades: Tensor | None = None
-    """Whether another vehicle makes a rapid evasive manoeuvre, boolean, shape (B,), as the scenario says; None where
+    """Whether another vehicle makes a rapid evasive manoeuvre, boolean, shape (B,), as the scenario says; None if
     it says nothing, or the measure does not ask (`EpisodeMeasure.twice`)."""
 
     @classmethod
@@ -90,9 +90,9 @@ class Obstacle(NamedTuple):
     gap: Tensor
     """Bumper to bumper along the road [m], in [`GAP_MIN`, `GAP_MAX`], shape (B,)."""
     closing_speed: Tensor
-    """Ego's speed less its own along the ego's heading [m/s]; 0 where there is none."""
+    """Ego's speed less its own along the ego's heading [m/s]; 0 if there is none."""
     vehicle: Tensor
-    """Its number, int64; 0 where there is none."""
+    """Its number, int64; 0 if there is none."""
 
 
 def find_obstacle(moment: Moment) -> Obstacle:
@@ -133,7 +133,7 @@ class EpisodeMeasure(ABC):
     unit: str = ""
     """Unit of f; empty for a number without one."""
     critical: float | None = None
-    """The critical value of a measure whose large values are dangerous; None where small ones are."""
+    """The critical value of a measure whose large values are dangerous; None if small ones are."""
     twice: bool = False
     """Whether f takes a second rollout of some episodes, as that of `rare_envs.measures.registry.NearCrash` does."""
 
@@ -211,14 +211,14 @@ class MeasureTerms:
 class Measure(EpisodeMeasure):
     """A measure that is decided by the most dangerous moment of an episode (f is the least), or that adds up over it.
 
-    Where large values are dangerous, such as those of a deceleration, f is the critical value less the value, so that
+    If large values are dangerous, such as those of a deceleration, f is the critical value less the value, so that
     f <= 0 says that the critical value was reached.
 
     Example:
         >>> import rare_envs
         >>> from rare_envs.measures.longitudinal import drac
         >>> comfort = Measure(drac, critical=2.0, collision=-100.0, unit="m/s^2")
-        >>> comfort.gamma(3.0)  # f <= -1 where avoiding a crash takes 3 m/s^2
+        >>> comfort.gamma(3.0)  # f <= -1 if avoiding a crash takes 3 m/s^2
         -1.0
         >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=comfort)
         >>> problem.evaluate([[20.0, 10.0, 25.0]]).round(2).tolist()  # at first 10^2 / (2 25) = 2 m/s^2, then less
@@ -237,7 +237,7 @@ class Measure(EpisodeMeasure):
     """f of an episode with a collision: a number, a function of the moment of the collision, or None for the least of
     the moments before it."""
     critical: float | None = None
-    """The critical value of a measure whose large values are dangerous; None where small ones are."""
+    """The critical value of a measure whose large values are dangerous; None if small ones are."""
     unit: str = "s"
     """Unit of f."""
     terms: MeasureTerms | None = field(default=None, repr=False)

@@ -151,7 +151,7 @@ def drac(moment: Moment) -> Tensor:
 def required_deceleration(moment: Moment) -> Tensor:
     """Return the least constant deceleration with which the ego never reaches a lead that brakes on as it does [m/s^2].
 
-    With b the deceleration of the lead over the last tick (0 where it speeds up), v the ego's speed, w the lead's and
+    With b the deceleration of the lead over the last tick (0 if it speeds up), v the ego's speed, w the lead's and
     dv = v - w: b + dv^2 / (2 gap) where the speeds become equal while the lead moves (Jansson, "Collision avoidance
     theory with application to automotive collision mitigation", 2005); v^2 / (2 (gap + w^2 / (2 b))) where the lead
     stops first, which it does if 2 gap / dv > w / b or dv <= 0. The lead is that of `drac`: bodies overlap across.
@@ -230,7 +230,7 @@ measures for road traffic safety assessment", 2001) look at up to 4 s."""
 
 
 def tet(moment: Moment, threshold: float = TTC_CRITICAL) -> Tensor:
-    """Return the integrand of the time exposed time-to-collision (TET), 1 where TTC is under its critical value [s]."""
+    """Return the integrand of the time exposed time-to-collision (TET), 1 if TTC is under its critical value [s]."""
     time = ttc(moment)
     return (time < threshold).to(time.dtype)
 

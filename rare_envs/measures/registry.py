@@ -146,7 +146,7 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
         ),
     }
 )
-"""Measures by name. Where large values are dangerous, f is the critical value less the value."""
+"""Measures by name. If large values are dangerous, f is the critical value less the value."""
 
 
 def find_measure(measure: Any) -> EpisodeMeasure:
@@ -222,7 +222,7 @@ def minimum(*measures: Any) -> Combined:
     """Return the most dangerous of several measures: the least of their f.
 
     Args:
-        *measures: Whatever `find_measure` takes.
+        *measures: Anything that `find_measure` takes.
 
     Raises:
         ValueError: If there is none, or one is unknown.
@@ -240,7 +240,7 @@ def weighted(*terms: tuple[Any, float]) -> Combined:
     """Return the weighted sum of measures; after a collision, the sum of their collision values.
 
     Args:
-        *terms: Pairs of a measure, whatever `find_measure` takes, and its weight, positive and finite.
+        *terms: Pairs of a measure, as `find_measure` takes it, and its weight, positive and finite.
 
     Raises:
         ValueError: If there is none, or a measure is unknown, or a weight is not positive.
@@ -264,7 +264,7 @@ def with_collision(measure: Any, value: float = COLLISION) -> Combined:
     """Return a measure in which an episode with a collision has one value: Tian et al.'s equation (3), for any measure.
 
     Args:
-        measure: Whatever `find_measure` takes.
+        measure: Anything that `find_measure` takes.
         value: f of an episode with a collision.
 
     Raises:
@@ -371,7 +371,7 @@ class TermTracker(EpisodeMeasure):
 def find_order(measure: EpisodeMeasure, collisions: str, gamma: float) -> tuple[Measure | None, float]:
     """Return the measure on whose terms to search for f <= gamma, and the threshold of these terms.
 
-    Where {f <= gamma} is the collision, as at gamma = 0 of times to collision, it is the clearance, between all where
+    If {f <= gamma} is the collision, as at gamma = 0 of times to collision, it is the clearance, between all where
     `collisions` are "any": it tells near from far where times are capped, and does not jump from car to car. Else the
     measure itself; None if that is no least over terms and moments.
     """

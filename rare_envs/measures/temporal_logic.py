@@ -56,7 +56,7 @@ def stl(formula: str) -> TraceMeasure:
 
     Negative where the formula is violated, so f <= 0 counts episodes that violate it (or just hold it), and a collision
     counts only if the formula speaks of it, as "always (clearance > 0)" does not quite: its signal is over 0 until
-    contact. `with_collision(stl(...), -100)` has collisions fail whatever the formula says.
+    contact. `with_collision(stl(...), -100)` has collisions fail with any formula.
 
     Args:
         formula: In rtamt's language, such as "always (gap > 2)" or "always[0:5] (ttc > 1.5 or speed < 3)"; times in s.

@@ -25,12 +25,12 @@ from rare_envs.traffic.bodies import (
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 CLEARANCE_MAX = 1000.0
-"""Cap of distances [m], where there is nobody."""
+"""Cap of distances [m], if there is nobody."""
 DRIFT = 0.2
 """Speed [m/s] with which `margin` expects any gap to close at least."""
 EARLY_SHARE = 0.45
 """Share of the horizon up to which a small distance is an early one. On the highway 3 of 72 collisions among rollouts
-from the base distribution came after tick 60 of 100: late drifts, from other directions than those at the start, which
+from the traffic model came after tick 60 of 100: late drifts, from other directions than those at the start, which
 a description of all together misses."""
 TIME_MIN = 1e-3
 """Times to contact are floored here [s], so that only a collision comes to 0 or less."""
@@ -106,7 +106,7 @@ def find_vehicle_or_edge(moment: Moment) -> Tensor:
 
 
 def find_nearest_pair(moment: Moment) -> Tensor:
-    """Return the number of the pair of vehicles that overlaps; where none does, of the nearest with the ego, (B,)."""
+    """Return the number of the pair of vehicles that overlaps; if none does, of the nearest with the ego, (B,)."""
     of_pairs, own = distances(moment, "all"), moment.state.x.shape[1] - 1
     touching = overlaps(moment.state, moment.road, "all").any(1)
     return torch.where(touching, of_pairs.argmin(1), of_pairs[:, :own].argmin(1))
@@ -188,7 +188,7 @@ def _least_between(before: Tensor, now: Tensor) -> Tensor:
 
 
 MARGIN_MAX = 1000.0
-"""Cap of margins [m], where there is nobody."""
+"""Cap of margins [m], if there is nobody."""
 
 
 @dataclass(frozen=True)

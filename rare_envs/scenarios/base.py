@@ -1,4 +1,4 @@
-"""Scenarios: parameters, an initial state, the motion of the vehicles around the ego, and their base distributions."""
+"""Scenarios: parameters, an initial state, the motion of the vehicles around the ego, and their traffic models."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Scenario:
     parameters: tuple[Parameter, ...]
     """Parameters in the columns of x, in order."""
     bases: Mapping[str, Any]
-    """Base distributions by name, the default first: JSON files, contents of such a file (names and box may be left
+    """Traffic models by name, the default first: JSON files, contents of such a file (names and box may be left
     out there), or distribution objects."""
     initial: Callable[[Tensor], State]
     """x (B, d) to the state at time 0."""
@@ -97,10 +97,10 @@ class Scenario:
     """Drivers of the other vehicles unless told otherwise; None for the script."""
     signals: Callable[[State], Tensor] | None = None
     """State, the ego first, to which other vehicles have their indicator on towards the ego's lane, boolean,
-    (B, N - 1); None where nobody ever has."""
+    (B, N - 1); None if nobody ever has."""
     evades: Callable[[State], Tensor] | None = None
     """State to whether a vehicle that had not looked has evaded the ego by now, boolean, (B,): a rapid evasive
-    manoeuvre by another vehicle, which makes an episode without contact a near-crash. None where nobody ever does."""
+    manoeuvre by another vehicle, which makes an episode without contact a near-crash. None if nobody ever does."""
 
     def __post_init__(self) -> None:
         if not all(isinstance(vehicle, str) and vehicle.strip() for vehicle in self.vehicle_names):
@@ -118,7 +118,7 @@ class Scenario:
             "as many labels as vehicles": len(labels) == self.vehicles,
             "parameters with different names, none of them 'x'": 0 < len(names) == len({*names, "x"}) - 1,
             "parameters with low < high": all(p.low < p.high and p.size >= 1 for p in self.parameters),
-            "at least one base distribution": len(self.bases) > 0,
+            "at least one traffic model": len(self.bases) > 0,
             "a horizon in s": math.isfinite(self.horizon) and self.horizon > 0,
         }.items():
             if not right:
@@ -131,7 +131,7 @@ class Scenario:
 
     @property
     def default_base(self) -> str:
-        """Name of the base distribution that is used unless another is named."""
+        """Name of the traffic model that is used unless another is named."""
         return next(iter(self.bases))
 
     @property
@@ -146,7 +146,7 @@ class Scenario:
 
 
 def base_files(prefix: str, *names: str) -> dict[str, Any]:
-    """Return the base distributions of these names that come with the package, as files."""
+    """Return the traffic models of these names that come with the package, as files."""
     folder = resources.files("rare_envs") / "data"
     return {name: folder / f"{prefix}_{name.replace('-', '_')}.json" for name in names}
 
@@ -214,7 +214,7 @@ DISTRIBUTION_METHODS = ("sample", "log_prob", "to_standard_normal", "from_standa
 
 
 def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | None = None) -> Distribution:
-    """Return the base distribution of a scenario.
+    """Return the traffic model of a scenario.
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and if wanted units,
     provenance, coordinates and order (see `TruncatedGaussianMixture`); or, for independent Beta variables, names, low,
@@ -245,13 +245,13 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
         return _check_object(scenario, found)
     if isinstance(found, Path) and (not found.exists() or found.is_dir()):
         raise ValueError(
-            f"No base distribution {str(base)!r} for {scenario.name}"
+            f"No traffic model {str(base)!r} for {scenario.name}"
             f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
         )
     try:
         text = read_text_file(found) if isinstance(found, Path) else found.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise ValueError(f"Cannot read the base distribution {str(found)!r}: {error}") from None
+        raise ValueError(f"Cannot read the traffic model {str(found)!r}: {error}") from None
     return _fit_to(scenario, str(base), _read_text(*where, text))
 
 
@@ -261,26 +261,26 @@ Known: TypeAlias = FileDistribution | FittedDistribution
 @lru_cache(maxsize=64)
 def _read_text(scenario: str, names: tuple[str, ...], source: str, text: str) -> Known:
     """Return the distribution of a text. It is kept: a file has some 100 refits, an environment is made often."""
-    return _read(scenario, names, source, parse_json_object(text, f"Base distribution {source}"))
+    return _read(scenario, names, source, parse_json_object(text, f"Traffic model {source}"))
 
 
 def _read(scenario: str, names: tuple[str, ...], source: str, data: Mapping[str, Any]) -> Known:
     """Return the distribution of a file, a fitted one if the file says what it was fitted to."""
     if data.get("names") != list(names):
         raise ValueError(
-            f"Base distribution {source} does not fit {scenario}: "
+            f"Traffic model {source} does not fit {scenario}: "
             f"expected names {list(names)} in this order, got {reprlib.repr(data.get('names'))}."
         )
     try:
         fitted = any(key in data for key in FITTED_KEYS)
         return FittedDistribution.from_dict(data) if fitted else read_distribution(data)
     except ValueError as error:
-        raise ValueError(f"Base distribution {source}: {error}") from None
+        raise ValueError(f"Traffic model {source}: {error}") from None
 
 
 def _fit_to(scenario: Scenario, source: str, distribution: Known) -> Distribution:
     """Return the distribution as one of a scenario, with its size and range checked."""
-    box, wrong = scenario.column_parameters, f"Base distribution {source} does not fit {scenario.name}: "
+    box, wrong = scenario.column_parameters, f"Traffic model {source} does not fit {scenario.name}: "
     if distribution.dim != len(box):
         raise ValueError(f"{wrong}expected {len(box)} columns, got {distribution.dim}.")
     for p, low, high in zip(box, distribution.low, distribution.high, strict=True):
@@ -297,14 +297,14 @@ def _check_object(scenario: Scenario, base: object) -> Distribution:
     missing = [name for name in DISTRIBUTION_METHODS if not callable(getattr(base, name, None))]
     if missing:
         raise ValueError(
-            f"A base distribution must be one of {', '.join(scenario.bases)}, a path to a JSON file, or an "
+            f"A traffic model must be one of {', '.join(scenario.bases)}, a path to a JSON file, or an "
             f"object with {', '.join(DISTRIBUTION_METHODS)}; got {type(base).__name__} without "
             f"{', '.join(missing)}."
         )
     distribution = cast(Distribution, base)
     box = scenario.column_parameters
     draws = np.asarray(distribution.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
-    wrong = f"Base distribution {type(base).__name__} does not fit {scenario.name}: "
+    wrong = f"Traffic model {type(base).__name__} does not fit {scenario.name}: "
     if draws.shape != (_TRIAL_DRAWS, len(box)):
         raise ValueError(
             f"{wrong}sample({_TRIAL_DRAWS}, rng) must have shape ({_TRIAL_DRAWS}, {len(box)}), one column for each "

@@ -175,7 +175,7 @@ class CutInTheta(NamedTuple):
     lasting: Tensor
     """Duration of its braking [s]."""
     loss: Tensor
-    """Its loss of speed in it [m/s]; 0 where it does not brake."""
+    """Its loss of speed in it [m/s]; 0 if it does not brake."""
     time: Tensor
     """Since the start [s]."""
     way: Tensor

@@ -78,7 +78,7 @@ def env_id_of(name: str) -> str:
 
 
 def split_version(env_id: str) -> tuple[str, int | None]:
-    """Return an id without its version, and the version; None where it has none."""
+    """Return an id without its version, and the version; None if it has none."""
     found = re.fullmatch(r"(.*)[-_][vV](\d+)", env_id)
     return (found[1], int(found[2])) if found else (env_id, None)
 

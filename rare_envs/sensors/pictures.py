@@ -96,7 +96,7 @@ VERGE: RGB = (0.38, 0.43, 0.25)
 WHITE_LINE: RGB = (0.92, 0.92, 0.92)
 YELLOW_LINE: RGB = (0.90, 0.72, 0.18)
 LINE_WIDTH = 0.15
-"""Of lane lines [m]: 6 inches, the upper end of a normal line (MUTCD, chapter 3A)."""
+"""Of lane lines [m]: 6 inches, the upper limit of a normal line (MUTCD, chapter 3A)."""
 DASH, PERIOD = 3.05, 12.19
 """Length of a dash and from one to the next [m]: 10 ft lines, 30 ft gaps (MUTCD, chapter 3A)."""
 _REACH = 15.0

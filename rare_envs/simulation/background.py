@@ -96,7 +96,7 @@ class BackgroundState(NamedTuple):
     """State of the drivers of M vehicles in B scenarios."""
 
     weights: Tensor
-    """Shape (B, W); W = 0 where all drivers are alike."""
+    """Shape (B, W); W = 0 if all drivers are alike."""
     draws: Tensor
     """Standard normal draws of the whole episode, shape (B, 2 + T, M, 2); (B, 0, M, 2) without noise."""
     memory: Tensor
@@ -114,7 +114,7 @@ class BackgroundState(NamedTuple):
 
     @property
     def innovations(self) -> Tensor | None:
-        """The draws of this tick, shape (B, M, 2), those of the last where no episode goes; None without noise."""
+        """The draws of this tick, shape (B, M, 2), those of the last if no episode goes; None without noise."""
         if not self.draws.shape[1]:
             return None
         row = torch.arange(len(self.tick), device=self.tick.device)

@@ -34,7 +34,7 @@ class Recording(NamedTuple):
     x: Tensor
     """Where it reads scenarios, shape (size, d)."""
     graph: Any
-    """The CUDA graph; None where the record broke off, because an operation waits for the GPU, as those of a camera."""
+    """The CUDA graph; None if the record broke off, because an operation waits for the GPU, as those of a camera."""
     end: Episode | None = None
     """Where it writes the episodes at the horizon."""
 
@@ -72,7 +72,7 @@ class RecordedRollouts:
             return rollout(world, self.driver, x)
 
     def _find(self, world: World, x: Tensor) -> Recording | None:
-        """Return the recording that x fits, made if need be; None where there cannot be one."""
+        """Return the recording that x fits, made if need be; None if there cannot be one."""
         size = next((size for size in self.sizes if size >= len(x)), None)
         if size is None or not is_recordable(world, self.driver):
             return None

@@ -123,7 +123,7 @@ def quantities_of(episode: Episode, action: Tensor) -> SimpleNamespace:
 
     speed [m/s]; heading, relative to the road, positive to the right [rad]; acceleration [m/s^2] and steering [rad]
     that the action (B, 2) asks for; of the vehicle ahead gap, bumper to bumper [m], closing_speed [m/s] and ttc [s],
-    inf without one or where it gets no nearer; lane, 0 the leftmost; lane_offset from its centre, positive to the right
+    inf without one or if it gets no nearer; lane, 0 the leftmost; lane_offset from its centre, positive to the right
     [m]; collision, with a vehicle or the edge of the road, boolean.
     """
     state, lead = episode.state, episode.lead

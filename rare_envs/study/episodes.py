@@ -30,7 +30,7 @@ from samplers.sample import SimulationRows
 MAX_SHOWN = 12
 """Blocks of more values than this, drivers' weights and noise, are summarised instead of shown."""
 ORDINARY_DRAWS = 4000
-"""Scenarios drawn from the base distribution to show what is ordinary."""
+"""Scenarios drawn from the traffic model to show what is ordinary."""
 LONGEST_KEY = 64
 """Bytes of a scenario that are its own digest."""
 

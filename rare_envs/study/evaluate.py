@@ -325,7 +325,7 @@ def run_into(
         force: Replace a run that the folder has, finished or not.
         executor: As in `run`.
         part: It is a part of a larger work, which is begun again as a whole: go on with the simulations of the same
-            question that the folder has, and keep all of them at the end. An ego that is an object begins anew.
+            question that the folder has, and keep all of them at the end. An ego that is an object starts again.
 
     Returns:
         The report.
@@ -381,7 +381,7 @@ def resume(
         if changed:
             raise BadInput(
                 f"{', '.join(changed)} has changed since the run in {str(folder)!r} was begun, and its simulations "
-                "are of what it was before. Begin anew with --force."
+                "are of what it was before. Start again with --force."
             )
         study = prepare(question)
         if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun

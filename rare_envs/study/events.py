@@ -1,6 +1,6 @@
 """Events: the kinds of event that a scenario stands for, each with its rate beside that of people in the same event.
 
-The strata of a base distribution are parts of p (`samplers.Estimate.parts`). Those that bear the name of an event of
+The strata of a traffic model are parts of p (`samplers.Estimate.parts`). Those that bear the name of an event of
 which people's contacts were counted, such as the brakings to a standstill among all brakings, are events of their own;
 the others are parts of the scenario's one event, such as the cutters who do not look. The rate of a part is the
 frequency of the scenario's events times its share times its p, and its interval has the error of the share, as each
@@ -43,18 +43,18 @@ class EventRate:
     share: float
     """Share of the scenario's events that are of this kind."""
     parts: Mapping[str, float]
-    """Shares of the rate by stratum; empty where there is one stratum, or nothing failed."""
+    """Shares of the rate by stratum; empty if there is one stratum, or nothing failed."""
     unresolved: Mapping[str, float] = field(default_factory=dict)
-    """Upper ends of the rate [per million km] in strata that are not resolved, see `samplers.method.Part`; that of an
+    """Upper limits of the rate [per million km] in strata that are not resolved, see `samplers.method.Part`; that of an
     event which is such a stratum under its own name."""
     traffic: str
-    """The base distribution, and the options that make other traffic of it."""
+    """The traffic model, and the options that make other traffic of it."""
     calibration: EventCalibration | None
-    """The human driver model in this event and traffic; None where nobody has measured it."""
+    """The human driver model in this event and traffic; None if nobody has measured it."""
 
     @property
     def people(self) -> HumanBenchmark | None:
-        """Contacts of people in the same event; None where nobody has counted them."""
+        """Contacts of people in the same event; None if nobody has counted them."""
         return people_in(self.event).contacts if self.event in COUNTED else None  # type: ignore[arg-type]
 
     @property
@@ -79,7 +79,7 @@ class EventRate:
 
 
 def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
-    """Return people's contacts in several kinds of event together; None where one of them was not counted."""
+    """Return people's contacts in several kinds of event together; None if one of them was not counted."""
     counted = [each.people for each in events]
     known = [each for each in counted if each is not None]
     if not known or len(known) < len(counted):
@@ -89,13 +89,13 @@ def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
 
 
 def describe_traffic(study: Study) -> str:
-    """Return the base distribution of a study, and the options that make other traffic of it."""
+    """Return the traffic model of a study, and the options that make other traffic of it."""
     changed = [f"--{name}" for name in ("drivers", "horizon") if getattr(study.question, name) is not None]
     return f"{study.base_name} with {' and '.join(changed)}" if changed else study.base_name
 
 
 def find_calibration(event: str, study: Study) -> EventCalibration | None:
-    """Return the calibration of an event in the traffic of a study; None where nobody measured it.
+    """Return the calibration of an event in the traffic of a study; None if nobody measured it.
 
     It is that of the newest version of the scenario: the scripts of earlier ones have drivers as there are none.
     """
@@ -105,9 +105,9 @@ def find_calibration(event: str, study: Study) -> EventCalibration | None:
 
 
 def bound_shares(estimate: samplers.Estimate) -> list[float]:
-    """Return the upper end of the share of each of `estimate.parts`: no more of the events can end in a collision.
+    """Return the upper limit of the share of each of `estimate.parts`: no more of the events can end in a collision.
 
-    It is that of a log-normal share with the spread of the refits; the share itself where the base has none.
+    It is that of a log-normal share with the spread of the refits; the share itself if the base has none.
     """
     shares, fitted = [part.share for part in estimate.parts], find_fitted_base(estimate.base)
     if fitted is None or len(fitted.refits) < 2 or fitted.clusters < 2:
@@ -121,7 +121,7 @@ def bound_shares(estimate: samplers.Estimate) -> list[float]:
 def list_part_errors(estimate: samplers.Estimate) -> list[BaseUncertainty | None]:
     """Return what the events behind the base leave open of share times p of each of `estimate.parts`, share included.
 
-    None where nothing failed, or the base has no refits.
+    None if nothing failed, or the base has no refits.
     """
     try:
         failures = analysis.weigh_failures(estimate)

@@ -96,14 +96,14 @@ class Severity:
     """How severe the collisions among the failures of a run are."""
 
     curve: analysis.Exceedance
-    """P[failure in a collision with delta-v > v] over v [m/s], with simultaneous bands of the sampling and, where the
+    """P[failure in a collision with delta-v > v] over v [m/s], with simultaneous bands of the sampling and, if the
     base has refits, of its events."""
     largest_delta_v: float
     """Largest delta-v among the failures that were simulated again [m/s]."""
     injuries: analysis.FailureExpectation
     """Expected serious injuries per scenario, both vehicles together."""
     injuries_base: analysis.BaseUncertainty | None
-    """Interval of the same that the events behind a fitted base distribution allow; None where it has no refits."""
+    """Interval of the same that the events behind a fitted traffic model allow; None if it has no refits."""
     n_replayed: int
     """Failing scenarios that were simulated again for it; not in the run's n_sim."""
     n_failures: int
@@ -119,13 +119,13 @@ class Severity:
             base = curve.base
             held = f"{100 * base.confidence:g} % of all thresholds together"
             parts = [f"> {curve.thresholds[i]:g} m/s {_format_ends(base.low[i], base.high[i])}" for i in shown]
-            lines.append(f"  base distribution {held}  {', '.join(parts)} ({base.fitted_to}, {base.n_refits} refits)")
+            lines.append(f"  traffic model {held}  {', '.join(parts)} ({base.fitted_to}, {base.n_refits} refits)")
         lines.append(
             f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
             f"{self.injuries.per_failure:.2g} per failure"
         )
         if self.injuries_base is not None:
-            lines.append(f"  {self.injuries_base}".splitlines()[0])
+            lines.append(f"  {self.injuries_base}".splitlines()[0].replace("base distribution", "traffic model"))
         lines.append(f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again")
         if self.unknown:
             lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
@@ -206,7 +206,7 @@ def compute_severity(
     further: ReplayedFailures | None = None,
     thresholds: ArrayLike | None = None,
 ) -> Severity | None:
-    """Return the severity of failures that were driven again; None where none of them is a collision."""
+    """Return the severity of failures that were driven again; None if none of them is a collision."""
     failures, any_vehicle = replayed.failures, problem.world.measurement.collisions == "any"
     delta_v, injuries = replayed.severities(any_vehicle)
     more: list[tuple[analysis.WeightedFailures, FloatArray] | None] = [None, None]
@@ -288,7 +288,7 @@ class FailureMode:
     drawn: FloatArray = field(default_factory=lambda: np.empty((0, 0)), repr=False)
     """Failing scenarios of it, drawn by their weights, shape (n, d)."""
     others: Mapping[str, OtherDriver] = field(default_factory=dict)
-    """What other drivers do in these, by name; empty where that is not known."""
+    """What other drivers do in these, by name; empty if that is not known."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -308,7 +308,7 @@ Labels = NDArray[np.object_]
 
 
 def find_modes(space: ScenarioSpace, estimate: samplers.Estimate, crashes: Crashes) -> tuple[FailureMode, ...]:
-    """Return the modes of failure of a run, the largest first; none where nothing failed or there are no weights."""
+    """Return the modes of failure of a run, the largest first; none if nothing failed or there are no weights."""
     found = assign_modes(space, estimate, crashes)
     if found is None:
         return ()
@@ -356,7 +356,7 @@ def assign_modes(
 
 
 def _find_kinds(x: FloatArray, crashes: Crashes, failed: NDArray[np.bool_] | None = None) -> Labels:
-    """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known, and where f failed."""
+    """Return the kinds of crash of scenarios x (n, d), shape (n,); "" where that is not known, and if f failed."""
     kinds = np.array([crashes.get(digest, "") for digest in digest_scenarios(x)], dtype=object)
     if failed is not None:
         kinds[failed] = analysis.NO_OUTCOME_LABEL
@@ -374,7 +374,7 @@ def label_modes(u: FloatArray, kinds: Labels) -> Labels:
 
 
 def cluster_points(u: FloatArray) -> NDArray[np.int64]:
-    """Return the cluster of each point u (n, k), shape (n,); all 0 where no clusters stand apart."""
+    """Return the cluster of each point u (n, k), shape (n,); all 0 if no clusters stand apart."""
     from sklearn.cluster import HDBSCAN
 
     least = max(LEAST_CLUSTER, math.ceil(LEAST_SHARE * len(u)))
@@ -410,7 +410,7 @@ class CrashKinds:
     modes: tuple[FailureMode, ...] = ()
     """Modes of failure, the largest first; empty if they are not known."""
     others_listed: Mapping[str, FloatArray] = field(default_factory=dict)
-    """f of each failure of the list with another driver in the ego's place, by its name; NaN where it did not drive."""
+    """f of each failure of the list with another driver in the ego's place, by its name; NaN if it did not drive."""
     others_unknown: Mapping[str, str] = field(default_factory=dict)
     """Why others cannot drive here, by name."""
     n_others: int = 0
@@ -557,7 +557,7 @@ def _list_more(
     if not missing:
         return estimate
     if estimate.base is None:
-        raise ValueError("The estimate does not know its base distribution.")
+        raise ValueError("The estimate does not know its traffic model (`Estimate.base` is None).")
     sample, failures = require_sample(estimate), estimate.failures
     log_density = np.asarray(estimate.base.log_prob(sample.x[rows]), dtype=np.float64)
     best = [int(np.argmax(np.where(mine, log_density, -np.inf))) for mine in missing]

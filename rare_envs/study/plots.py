@@ -48,11 +48,11 @@ BACKGROUND_DRAWS = 2000
 MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
 VIEW_BEHIND, VIEW_FAR_BEHIND, VIEW_AHEAD = 12.0, 45.0, 48.0
-"""Extent of a bird's-eye view of the road around the ego [m]; further behind where there is traffic."""
+"""Extent of a bird's-eye view of the road around the ego [m]; further behind if there is traffic."""
 NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
-"""Upper ends of the curves' axes over their largest values: room for the legend."""
+"""Upper limits of the curves' axes over their largest values: room for the legend."""
 LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = rendering.ROLE_COLOURS["ego"], "#c0392b", "#b8b8b8"
 """What is of the ego, in curves as on the road; failures; and ordinary traffic or people."""
 MODEL_COLOUR = "#8e5aa8"
@@ -227,7 +227,7 @@ def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
         n_sim = int(result["n_sim"])
         spent = np.geomspace(1.0, max(n_sim, 2), 100)
         bound = np.minimum(high * n_sim / spent, 1.0)
-        axes.plot(spent, bound, color=HIT_COLOUR, linewidth=1, label="upper end without a failure: as 1 / simulations")
+        axes.plot(spent, bound, color=HIT_COLOUR, linewidth=1, label="upper limit without a failure, ~ 1 / simulations")
     if p > 0:
         axes.axhline(p, color=HIT_COLOUR, linewidth=1, label="result")
     label = f"{100 * float(result['confidence']):g} % interval"
@@ -337,7 +337,7 @@ def draw_speeds(axes: Axes, drive: Drive) -> None:
 
 
 SHOWN_SECONDS = 5.0
-"""Upper end of the axis of a measure in seconds: what is above shows as a gap, the cap of a time to collision too."""
+"""Upper limit of the axis of a measure in seconds: what is above shows as a gap, the cap of a time to collision too."""
 
 
 def draw_measure(axes: Axes, drive: Drive) -> None:
@@ -431,7 +431,7 @@ def draw_rates(axes: Axes, rows: Sequence[RateRow]) -> None:
 
 
 def _draw_interval(axes: Axes, y: float, value: float, ends: RateInterval, colour: str, start: float) -> None:
-    """Draw a value with its interval; an upper end alone as an arrow out of the axis."""
+    """Draw a value with its interval; an upper limit alone as an arrow out of the axis."""
     low, high = ends
     if low > 0:
         axes.plot([low, high], [y, y], color=colour, linewidth=9, alpha=0.35, solid_capstyle="butt")

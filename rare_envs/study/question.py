@@ -108,22 +108,22 @@ class Study:
     problem: DrivingProblem
     method: samplers.methods.Stepping
     other_bases: Mapping[str, Distribution] = field(default_factory=dict)
-    """Distributions of x under the other base distributions that the question names."""
+    """Distributions of x under the other traffic models that the question names."""
     ego_was_given: bool = False
     """Whether the ego is an object of the caller's, and not the one that the question names."""
 
     @cached_property
     def base(self) -> Distribution:
-        """The base distribution that the question names, with what is known of its events."""
+        """The traffic model that the question names, with what is known of its events."""
         return load_base(find_scenario(self.question.env_id), self.question.base)
 
     @property
     def fitted(self) -> FittedDistribution | None:
-        """The same, if it was fitted to events; None where it was assembled otherwise."""
+        """The same, if it was fitted to events; None if it was assembled otherwise."""
         return self.base if isinstance(self.base, FittedDistribution) else None
 
     def under(self, base: str) -> Study:
-        """Return the same study with another base distribution, by name or file; the ego is the one that is loaded."""
+        """Return the same study with another traffic model, by name or file; the ego is the one that is loaded."""
         question = replace(self.question, base=base, ensemble=False)
         return replace(self, question=question, problem=build_problem(question, self.problem.ego))
 
@@ -199,9 +199,9 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
             base = load_base(find_scenario(question.env_id), base)
             if not isinstance(base, FittedDistribution) or not base.refits:
                 name = "the default" if question.base is None else repr(question.base)
-                raise ValueError(f"The base distribution ({name}) has no refits, so there is no ensemble of them.")
+                raise ValueError(f"The traffic model ({name}) has no refits, so there is no ensemble of them.")
             if read_strata(base):
-                raise ValueError("The base distribution has strata, whose refits have no ensemble.")
+                raise ValueError("The traffic model has strata, whose refits have no ensemble.")
             base = base.ensemble()
         world = {name: getattr(question, name) for name in PROBLEM_FIELDS}
         return DrivingProblem(question.env_id, ego=ego, base=base, **world)

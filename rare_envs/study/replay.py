@@ -186,7 +186,7 @@ def read_row(table: Mapping[str, NDArray[Any]], problem: DrivingProblem, number:
         wanted = ", ".join(problem.space.names)
         raise BadInput(f"Expected {FAILURES} with the columns {wanted}; the run is of another problem.") from error
     if not np.isfinite(x).all() or not np.isfinite(problem.base.log_prob(x[None])).all():
-        raise BadInput(f"Failure {number} in {FAILURES} is no scenario of {problem.env_id} and its base distribution.")
+        raise BadInput(f"Failure {number} in {FAILURES} is no scenario of {problem.env_id} and its traffic model.")
     return x
 
 

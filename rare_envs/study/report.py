@@ -44,15 +44,15 @@ REACH = 0.5
 COLLISION_MEASURE = "ttc"
 """The measure to advise: -1 after a collision and above 0 without one."""
 MODEL_NOUN = "traffic model"
-"""What a base distribution of scenarios is called."""
+"""What a traffic model of scenarios is called."""
 ENSEMBLE_REASON = (
-    "the parameters of an ensemble are those of all its refits; without --ensemble derivatives are by those of the base"
+    "the parameters of an ensemble are those of all its refits; without --ensemble there are derivatives"
 )
 """Why there are no derivatives of the mean over refits."""
 
 
 def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | None:
-    """Return p over thresholds, up to that at which `REACH` of the weight lies; None where the run does not tell it."""
+    """Return p over thresholds, up to that at which `REACH` of the weight lies; None if the run does not tell it."""
     sample = estimate.sample
     if sample is None or estimate.p <= 0:
         return None
@@ -68,7 +68,7 @@ def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | Non
 
 
 def explain_other_events(question: Question) -> str:
-    """Return which option makes a question count other events than collisions of the ego; empty where none does."""
+    """Return which option makes a question count other events than collisions of the ego; empty if none does."""
     measure = MEASURES.get(question.measure)
     if not (isinstance(measure, Measure) and measure.collisions_only):
         advised = f"counts other events than collisions (--measure {COLLISION_MEASURE} does)"
@@ -108,7 +108,7 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> str:
 
 
 def has_exact_bound(estimate: samplers.Estimate) -> bool:
-    """Return whether the answer is the upper end, exactly: no simulation failed, and all are draws from the base."""
+    """Return whether the answer is the upper limit, exactly: no simulation failed, and all are draws from the base."""
     return estimate.status is samplers.Status.NO_HITS and estimate.base_draws == estimate.n_sim
 
 
@@ -122,21 +122,21 @@ class Repeatability(NamedTuple):
     largest: float
     """Largest difference of f."""
     n_elsewhere: int | None = 0
-    """Answers of an ego `module:function` that are others in another process; None where it gave none there."""
+    """Answers of an ego `module:function` that are others in another process; None if it gave none there."""
 
     @property
     def warning(self) -> str:
         """Doubt about p; "" if none differ."""
         if self.n_differing:
             return (
-                f"of {self.n} simulations done again in another order and company {self.n_differing} gave another f, "
-                f"by up to {self.largest:.3g}: the ego or the measure is random, keeps something from one call to the "
-                "next, or mixes the rows of a batch, so p may be wrong by any factor; rare-envs check-ego may say where"
+                f"{self.n_differing} of {self.n} simulations gave another f when repeated in another order, by up to "
+                f"{self.largest:.2g}: the ego or the measure is random, keeps a memory between calls, or mixes the "
+                "rows of a batch. p may be wrong by any factor; rare-envs check-ego looks for the cause"
             )
         if self.n_elsewhere:
             return (
-                f"{self.n_elsewhere} answers of the ego are others in another process: they depend on its number, its "
-                "hashes (PYTHONHASHSEED) or something else of it, so p is that of this process alone"
+                f"the ego gave {self.n_elsewhere} other answers in another process: they depend on the process (its "
+                "number, PYTHONHASHSEED), so p is that of this process alone"
             )
         return ""
 
@@ -205,19 +205,19 @@ class Report:
 
     @property
     def doubtful(self) -> bool:
-        """Whether there is a warning that p, or the error of its base distribution, may be wrong."""
+        """Whether there is a warning that p, or the error of its traffic model, may be wrong."""
         return bool(self.warnings)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
+        """Doubts about p: of the method, the traffic model, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"{MODEL_NOUN}: {text}" for text in base.warnings)
         return (*self.doubts_of_method, *doubts, *self.doubts_of_f)
 
     @property
     def doubts_of_method(self) -> tuple[str, ...]:
-        """Warnings of the estimate, but for that of an exact upper end."""
+        """Warnings of the estimate, but for that of an exact upper limit."""
         return () if has_exact_bound(self.estimate) else self.estimate.warnings
 
     @property
@@ -241,7 +241,7 @@ class Report:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Facts about how the run went that cast no doubt on the numbers."""
+        """Facts about how the run went that do not question the numbers."""
         return (*(self.estimate.warnings if has_exact_bound(self.estimate) else ()), *self.estimate.remarks)
 
     @property
@@ -252,19 +252,19 @@ class Report:
         drivers_vary = world.background is not None and world.background.noisy
         if noise is not True and not world.sensing.weather and not drivers_vary:
             word = "off" if noise is False else noise
-            found.insert(0, f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)")
+            found.insert(0, f"--noise {word} changes nothing: no driver here has noise (see --drivers)")
         found += [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
         found += [f"what {name} would do is not known: {why}" for name, why in self.kinds.others_unknown.items()]
         found += [f"sensitivity is not known: {self.sensitivity}"] if isinstance(self.sensitivity, str) else []
         if self.repeatability is not None and self.repeatability.n_elsewhere is None:
-            found.append("whether the ego answers alike in another process is not known: it gave no answer there")
+            found.append("the ego gave no answer in another process, so whether it answers the same there is not known")
         found += [self.lost] if self.lost else []
         left_out = "" if self.no_rate else describe_left_out(self.study, self.estimate)
-        return (*found, *([f"left out of the intervals: {left_out}"] if left_out else []))
+        return (*found, *([f"not in the intervals: {left_out}"] if left_out else []))
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:
-        """The crash of each listed failure, see `rare_envs.traffic.crash.describe_crash`; None where nobody crashed."""
+        """The crash of each listed failure, see `rare_envs.traffic.crash.describe_crash`; None if nobody crashed."""
         return self.kinds.listed or (None,) * len(self.estimate.failures)
 
     @cached_property
@@ -285,7 +285,7 @@ class Report:
 
     @property
     def indecision(self) -> str:
-        """Why nothing can be said of a limit, whatever it is; empty where something can."""
+        """Why nothing can be said of any limit; empty if something can."""
         said = self.estimate.meets(0.5, self.study.question.assume_traffic).reason
         return said or find_doubt(self.doubts_of_f)
 
@@ -298,7 +298,7 @@ class Report:
 
     @cached_property
     def curve(self) -> samplers.Curve | None:
-        """Probability over the threshold, from the same simulations; None where the run does not tell it."""
+        """Probability over the threshold, from the same simulations; None if the run does not tell it."""
         return compute_threshold_curve(self.estimate)
 
     @cached_property
@@ -312,13 +312,13 @@ class Report:
 
     @cached_property
     def rate(self) -> CollisionRate | None:
-        """Collisions per million km; None where `no_rate` says why there are none."""
+        """Collisions per million km; None if `no_rate` says why there are none."""
         estimate = self.estimate
         return self._rate_of(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
 
     @cached_property
     def events(self) -> tuple[EventRate, ...]:
-        """The rate of each kind of event that the scenario stands for; empty where `no_rate` says why there is none."""
+        """The rate of each kind of event that the scenario stands for; empty if `no_rate` says why there is none."""
         whole, parts = self.rate, self.estimate.parts
         if whole is None:
             return ()
@@ -344,7 +344,7 @@ class Report:
     def _rate_parts(self, whole: CollisionRate) -> list[tuple[str, float, CollisionRate]]:
         """Return name, share and rate of each stratum, at most that of the whole, and one collision in each event.
 
-        Of a stratum that is not resolved the upper end alone is known, and refits of what was found say nothing.
+        Of a stratum that is not resolved the upper limit alone is known, and refits of what was found say nothing.
         """
         assert whole.interval is not None  # `_rate_of` gives it
         found, estimate = [], self.estimate
@@ -358,7 +358,7 @@ class Report:
 
     @cached_property
     def injury_rate(self) -> CollisionRate | None:
-        """Serious injuries (MAIS 3 or more) per million km; None where there is no rate, or no collision."""
+        """Serious injuries (MAIS 3 or more) per million km; None if there is no rate, or no collision."""
         severity = self.kinds.severity
         if severity is None:
             return None
@@ -399,7 +399,7 @@ class Report:
 
     @cached_property
     def other_bases(self) -> dict[str, samplers.analysis.Reweighted | str]:
-        """P under the other base distributions that the question names, by name, or why this run does not give it."""
+        """P with the other traffic models that the question names, by name, or why this run does not give it."""
         found: dict[str, samplers.analysis.Reweighted | str] = {}
         for name, base in self.study.other_bases.items():
             try:

@@ -46,7 +46,7 @@ contains the cut-ins."""
 
 
 def _load_fitted(scenario: Scenario, name: str) -> FittedDistribution | None:
-    """Return a base that was fitted to events; None where it was assembled otherwise."""
+    """Return a base that was fitted to events; None if it was assembled otherwise."""
     base = load_base(scenario, name)
     return base if isinstance(base, FittedDistribution) else None
 
@@ -63,7 +63,7 @@ def list_sites(scenario: Scenario) -> dict[str, str]:
 
 
 def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> str:
-    """Return the base distribution of a scenario at a site, or the one that is given."""
+    """Return the traffic model of a scenario at a site, or the one that is given."""
     if given is not None:
         return str(given)
     sites = list_sites(scenario)
@@ -157,7 +157,7 @@ class Risk:
 
     @cached_property
     def injuries(self) -> exposure.TotalRate | None:
-        """Serious injuries (MAIS 3 or more), summed over the scenarios with collisions; None where there are none."""
+        """Serious injuries (MAIS 3 or more), summed over the scenarios with collisions; None if there are none."""
         found = [(each.report.injury_rate, each.rate.site_log_sd) for each in self.scenarios]
         rates = tuple(replace(rate, site_log_sd=spread) for rate, spread in found if rate is not None)
         return exposure.TotalRate(rates) if rates else None
@@ -177,7 +177,7 @@ class Risk:
 
     @property
     def people(self) -> HumanBenchmark | None:
-        """Contacts of people in the same events together; None where those of one kind were not counted."""
+        """Contacts of people in the same events together; None if those of one kind were not counted."""
         return sum_people(self.events)
 
     @cached_property
@@ -199,7 +199,7 @@ class Risk:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts about p and about the error of its base distribution, by scenario."""
+        """Doubts about p and about the error of its traffic model, by scenario."""
         named = ((text.name_scenario(each.name), each.report.warnings) for each in self.scenarios)
         left_out = (f"{text.name_scenario(name)} is left out: {why}" for name, why in self.left_out.items())
         return (*left_out, *(f"{name}: {warning}" for name, warnings in named for warning in warnings))
@@ -280,8 +280,8 @@ def risk(
 ) -> Risk:
     """Estimate the collisions of an ego per million km, with an interval that holds what is not known of traffic.
 
-    Each scenario's p is multiplied by the frequency of its events, and the products are added. The interval holds the
-    errors of the counted events, of the fitted base distributions and of the simulations; with several `sites` also
+    Each scenario's p is multiplied by the frequency of its events, and the products are added. The interval includes the
+    errors of the counted events, of the fitted traffic models and of the simulations; with several `sites` also
     the spread between them. All holds for an ego that takes over at the moment of each event. A policy whose
     observations or actions do not fit one of the scenarios is evaluated in the others, with a warning.
 
@@ -291,7 +291,7 @@ def risk(
         sites: Names of sites, each that of the first base fitted to events of it, such as "us101": the bases of the
             first are used, and the spread of the rate between it and the others is part of the interval. Each
             scenario must have a base of the first site, or one in `bases`.
-        bases: Base distributions, names or JSON files, by scenario, in place of those of the first site.
+        bases: Traffic models, names or JSON files, by scenario, in place of those of the first site.
         out: Folder for the picture, the numbers and a folder of each scenario. After an interruption the same call
             goes on with the simulations that it has, unless the ego is an object.
         progress: Show a bar on standard error.

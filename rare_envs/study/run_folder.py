@@ -72,7 +72,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     Returns:
         Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,), and what the
         failure ended in: "crash" (words) and the numbers of `CRASH`, NaN without a crash; and f with other drivers in
-        the ego's place ("f_human", NaN where it did not drive). The parameters of row k
+        the ego's place ("f_human", NaN if it did not drive). The parameters of row k
         replay by `env.reset(options={name: failures[name][k] for name in env.unwrapped.space.names})`.
 
     Raises:

@@ -255,7 +255,7 @@ NAMED_SHARE = 1e-4
 WHOLE = 1_000
 """Lines of an answer that is not cut."""
 CRASHES = "Crashes"
-"""The name of p where it counts collisions of the ego."""
+"""The name of p if it counts collisions of the ego."""
 
 
 ENOUGH, MANY = 30, 1_000_000

@@ -37,7 +37,7 @@ from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
 
 BEGIN_AGAIN = "give the command again."
-"""Advice where there is nothing to continue."""
+"""Advice if there is nothing to continue."""
 SAME_AGAIN = "the same command again, without --force."
 """How goes on what is no single estimate."""
 
@@ -78,25 +78,25 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
     try:
         journal = Journal.open(path, mend)
     except FileNotFoundError as error:
-        why = f"it has no {run_folder.JOURNAL}. Of one that was {begun}, {BEGIN_AGAIN}"
+        why = f"it has no {run_folder.JOURNAL}. If the run was {begun}, {BEGIN_AGAIN}"
         if (folder / run_folder.RESULT).is_file():
             why = f"it has a finished one ({run_folder.RESULT})."
         elif next(folder.glob(f"*/{run_folder.JOURNAL}"), None):
             why = f"its parts go on with {SAME_AGAIN}"
         elif not folder.is_dir():
-            why = f"the folder does not exist. Of a run that was {begun}, {BEGIN_AGAIN}"
+            why = f"the folder does not exist. If the run was {begun}, {BEGIN_AGAIN}"
         raise BadInput(f"There is no unfinished run in {str(folder)!r}: {why}") from error
     except NothingRecorded as error:
         raise BadInput(f"The run in {str(folder)!r} was {begun}: {BEGIN_AGAIN}") from error
     except OSError as error:
-        raise BadInput(f"Cannot take up {str(path)!r}: {error.strerror}.") from error
+        raise BadInput(f"Cannot resume {str(path)!r}: {error.strerror}.") from error
     except JournalError as error:
         advice = ""
         if "damaged from its first record on" in str(error):
             advice = " Nothing can be taken from it: it is left as it is, and the command with --force replaces it."
         elif "damaged" in str(error):
             again = f"rare-envs resume {shlex.quote(str(folder))} --mend"
-            advice = f" What stands before the damage is kept by {again}."
+            advice = f" To keep what is before the damage: {again}."
         raise BadInput(f"{error}{advice}") from error
     version = journal.head.get("version")
     try:
@@ -105,7 +105,7 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
         return journal, read_question(journal.head.get("question"))
     except BadInput as error:
         journal.close()
-        raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
+        raise BadInput(f"Cannot resume {str(path)!r}: {error}") from error
 
 
 @contextlib.contextmanager
@@ -114,7 +114,7 @@ def journals_of(
 ) -> Iterator[Sequence[Journal | None]]:
     """Yield the journals of the parts of a command, each in a folder in `out`; what stops it says what they keep.
 
-    Where it begins by `force`, the parts and the results of an earlier one are removed. None without `out`.
+    If it begins by `force`, the parts and the results of an earlier one are removed. None without `out`.
     """
     with contextlib.ExitStack() as stack:
         if out is None:
@@ -212,7 +212,7 @@ def write_run(folder: Path, report: Report) -> None:
 
 
 def _list_crash(crash: dict[str, Any] | None) -> tuple[Any, ...]:
-    """Return a crash as the columns `CRASH`; () where there is none."""
+    """Return a crash as the columns `CRASH`; () if there is none."""
     if crash is None:
         return ()
     speeds = (crash["impact_speed"], crash["closing_speed"])
@@ -228,7 +228,7 @@ def write_failures(
 ) -> None:
     """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and the columns `CRASH` if known.
 
-    Then f with other drivers in the ego's place, as "f_human"; the cell is empty where it did not drive.
+    Then f with other drivers in the ego's place, as "f_human"; the cell is empty if it did not drive.
     """
     f_others = [["" if np.isnan(f) else f for f in each.tolist()] for each in others.values()]
     beside = list(zip(*f_others, strict=True)) or [()] * len(failures)

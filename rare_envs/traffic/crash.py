@@ -173,7 +173,7 @@ def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
 
 
 def describe_crash(crash: Crash, row: int = 0) -> dict[str, Any] | None:
-    """Return one crash in plain values, for `info` and for files; None where there was none.
+    """Return one crash in plain values, for `info` and for files; None if there was none.
 
     Returns:
         "kind" (of `CRASH_KINDS`), "vehicles" (who ran into whom), "impact_speed", "closing_speed", "delta_v" [m/s] and

@@ -1,6 +1,6 @@
 """Traffic states: B scenarios with N vehicles each; trees of tensors; and vehicle models, one explicit Euler step each.
 
-HighwayEnv's kinematic bicycle and a point mass move in road coordinates. Where the road is curved, with curvature k, a
+HighwayEnv's kinematic bicycle and a point mass move in road coordinates. If the road is curved, with curvature k, a
 way of d metres along the road at y is d / (1 - k y) of the reference line, and the road turns under the vehicle by k
 times that.
 """
@@ -144,7 +144,7 @@ def bicycle(
     beta = atan(tan(steering) / 2), then x, y [m] and heading [rad] move with the old speed and heading, and the speed
     [m/s] last, by acceleration [m/s^2] and front wheel angle [rad] (Polack et al., "Kinematic bicycle model", 2017).
     HighwayEnv's `Vehicle.step` is the same but for one deliberate difference: it lets vehicles reverse, ours stop. The
-    curvature [1/m] is the road's at x. On a straight road (None), where nobody steers and all headings are 0, `y` and
+    curvature [1/m] is the road's at x. On a straight road (None), if nobody steers and all headings are 0, `y` and
     `heading` are the tensors that were given: write into neither.
     """
     tick, half, half_length = scalars((dt, 0.5, VEHICLE_LENGTH / 2), speed)

@@ -94,7 +94,7 @@ def car_following_events(trajectories: Trajectories) -> Events:
 
 
 def bumper_gaps(trajectories: Trajectories, behind: NDArray[np.int64], before: NDArray[np.int64]) -> FloatArray:
-    """Return distances from bumper to bumper between rows behind and before (n,) [m], NaN where a row is -1."""
+    """Return distances from bumper to bumper between rows behind and before (n,) [m], NaN if a row is -1."""
     t = trajectories
     value = t.x[before] - t.x[behind] - 0.5 * (t.length[before] + t.length[behind])
     return np.where((behind >= 0) & (before >= 0), value, np.nan)
@@ -143,9 +143,9 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         The columns recording, frame, phase, vehicle, from_lane, to_lane, start_seen, v_cutin, lateral_speed, ego,
         v_ego, gap_ego_cutin, lateral_offset, lead, v_lead, gap_cutin_lead, duration and those of `ANSWERS`, each of
         shape (2 changes,). Ego is the nearest vehicle behind in the new lane, lead the nearest ahead in it, -1 and NaN
-        where there is none. Gaps are bumper to bumper (negative: side by side). Also the lateral offset from ego [m];
+        if there is none. Gaps are bumper to bumper (negative: side by side). Also the lateral offset from ego [m];
         `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s]; `duration` of the cubic course that
-        moves across for as long [s], NaN where start or end was not recorded; of ego and cutter, see `measure_answer`,
+        moves across for as long [s], NaN if start or end was not recorded; of ego and cutter, see `measure_answer`,
         the mean acceleration and the hardest braking that follow [m/s^2].
 
     Example:
@@ -195,7 +195,7 @@ def cut_in_events(trajectories: Trajectories) -> Events:
 def measure_answers(
     breaks: NDArray[np.int64], position: FloatArray, speed: FloatArray, rows: NDArray[np.int64]
 ) -> FloatArray:
-    """Return what follows rows of tracks one behind the other, (n, 2), see `measure_answer`; NaN where a row is -1.
+    """Return what follows rows of tracks one behind the other, (n, 2), see `measure_answer`; NaN if a row is -1.
 
     The tracks begin at the rows `breaks`; position [m] and speed [m/s] are theirs.
     """
@@ -213,8 +213,8 @@ def measure_answer(position: FloatArray, speed: FloatArray, at: int) -> tuple[fl
     """Return the mean acceleration over the 2 s after a tick of a track, and the hardest braking in 3 s [m/s^2].
 
     Position along the road [m] and speed as recorded [m/s] have shape (T,). The later speed is the mean of 0.7 s
-    about its moment, as speeds jitter; the braking is that of the positions smoothed at 0.40 Hz, 0 where there is
-    none. NaN where the track ends before.
+    about its moment, as speeds jitter; the braking is that of the positions smoothed at 0.40 Hz, 0 if there is
+    none. NaN if the track ends before.
     """
     later, last = at + round(MEAN_SECONDS / DT), at + round(ANSWER_SECONDS / DT)
     mean, braking = np.nan, np.nan
@@ -251,7 +251,7 @@ def course_durations(above: FloatArray, displacement: FloatArray) -> FloatArray:
     A recording shows for how long a vehicle moves across faster than some speed; when it begins and ends to move cannot
     be seen. The course y = D (3 t^2 - 2 t^3), t from 0 to 1 in T, has the speed across 6 D t (1 - t) / T, above v for
     T sqrt(1 - 2 v T / (3 D)). The shorter of the two T is taken; where a course never moves that long, the one that
-    does so longest, T = D / v. NaN where the time above (n,) [s] is not known or D (n,) [m] is not positive.
+    does so longest, T = D / v. NaN if the time above (n,) [s] is not known or D (n,) [m] is not positive.
     """
     known = np.isfinite(above) & (displacement > 0.0)
     time, side = np.where(known, above, 0.0), np.where(known, displacement, 1.0)
@@ -328,7 +328,7 @@ def hard_brake_events(trajectories: Trajectories) -> Events:
 
     Returns:
         The columns recording, frame, vehicle, lane, lead, speed, gap, peak and loss, each of shape (events,): speed
-        [m/s] of smoothed positions, `gap` from bumper to bumper to the vehicle's own leader [m], NaN where none is
+        [m/s] of smoothed positions, `gap` from bumper to bumper to the vehicle's own leader [m], NaN if none is
         recorded or a length is not known, the `peak` of the deceleration [m/s^2] and the `loss` of speed [m/s], all of
         it in a braking to a standstill. Who follows the vehicle does not matter, so its own gap stands for that behind
         it.

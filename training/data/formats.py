@@ -176,7 +176,7 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
     Args:
         path: CSV with the published header (the order of columns does not matter, others are ignored), or text with the
             18 published columns and no header, separated by blanks or commas; either may be gzipped.
-        location: Which of the file's locations to read, such as "us-101", where it has several.
+        location: Which of the file's locations to read, such as "us-101", if it has several.
         gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
 
     Raises:

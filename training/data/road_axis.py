@@ -17,7 +17,7 @@ KNOT_DISTANCE = 100.0
 """Distance [m] between the knots of the axis: shorter than curves of motorways, longer than a lane change."""
 ROUGHNESS = 1e-4
 """Weight of the squared third differences of the coefficients, relative to the mean number of bins in a knot span: it
-settles the axis where nobody was recorded, and hardly moves it elsewhere."""
+settles the axis if nobody was recorded, and hardly moves it elsewhere."""
 FOOT_STEPS = 4
 """Steps towards the foot of the perpendicular; each leaves the square of the error."""
 SLOPE_STEPS = 4
@@ -143,7 +143,7 @@ def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, 
 
 
 def number_lanes(y: FloatArray, lane: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return lanes (rows,) counted from the left by their median positions [m]; 0 where of the rarer sign, or 0."""
+    """Return lanes (rows,) counted from the left by their median positions [m]; 0 if of the rarer sign, or 0."""
     inside = lane * (1 if (lane > 0).sum() >= (lane < 0).sum() else -1) > 0
     result = np.zeros(len(lane), dtype=np.int64)
     numbers = np.unique(lane[inside])

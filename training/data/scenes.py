@@ -39,7 +39,7 @@ class TrafficScene:
     """States and actions of V vehicles at T steps, 0.1 s apart, on a straight road.
 
     Positions are box centres: x along the road, y across and positive to the right [m], heading relative to the road
-    [rad], positive to the right. Arrays are float64 and NaN where there is no value.
+    [rad], positive to the right. Arrays are float64 and NaN if there is no value.
 
     Raises:
         ValueError: Arrays differ in shape, or a state is missing where a vehicle is present.
@@ -64,11 +64,11 @@ class TrafficScene:
     heading: FloatArray
     speed: FloatArray
     acceleration: FloatArray
-    """From this step to the next [m/s^2]; NaN where the record ends before it is known."""
+    """From this step to the next [m/s^2]; NaN if the record ends before it is known."""
     yaw_rate: FloatArray
-    """From this step to the next [rad/s]; NaN where the acceleration is."""
+    """From this step to the next [rad/s]; NaN if the acceleration is."""
     present: Mask
-    """True where x, y, heading and speed are known."""
+    """True if x, y, heading and speed are known."""
     length: FloatArray
     """Shape (V,) [m]."""
     width: FloatArray
@@ -92,7 +92,7 @@ class TrafficScene:
 
     @property
     def acted(self) -> Mask:
-        """True where state and action are known, shape (T, V)."""
+        """True if state and action are known, shape (T, V)."""
         known: Mask = self.present & np.isfinite(self.acceleration)
         return known
 
@@ -102,7 +102,7 @@ class TrafficScene:
         return np.where(self.present & (inner < len(self.edges) - 1), inner, -1)
 
     def leads_lane(self) -> Mask:
-        """Return True where nobody ahead is recorded in the vehicle's lane, shape (T, V).
+        """Return True if nobody ahead is recorded in the vehicle's lane, shape (T, V).
 
         Such a vehicle may have reacted to somebody outside the window, so its actions are no examples to learn from.
         """

@@ -62,19 +62,19 @@ class Trajectories:
     x: FloatArray
     """[m]"""
     y: FloatArray
-    """[m]; NaN where it was not recorded."""
+    """[m]; NaN if it was not recorded."""
     speed: FloatArray
     """As recorded [m/s], not negative."""
     acceleration: FloatArray
-    """As recorded, along the road [m/s^2]; NaN where it was not recorded."""
+    """As recorded, along the road [m/s^2]; NaN if it was not recorded."""
     length: FloatArray
-    """[m]; NaN where it was not recorded (x is the front then)."""
+    """[m]; NaN if it was not recorded (x is the front then)."""
     width: FloatArray
-    """[m]; NaN where it was not recorded."""
+    """[m]; NaN if it was not recorded."""
     lane: Integers
     """Number of the lane, 1 the leftmost; 0 outside the lanes or not recorded."""
     leader: Integers
-    """Number of the vehicle ahead in the same lane, `NOBODY` where none is recorded."""
+    """Number of the vehicle ahead in the same lane, `NOBODY` if none is recorded."""
     edges: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     """y of the lane boundaries of a recording, left to right [m]: lane n is between the n-th and the next."""
 
@@ -165,7 +165,7 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
 def find_leaders(
     vehicle: NDArray[Any], frame: NDArray[Any], lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None
 ) -> NDArray[Any]:
-    """Return the nearest vehicles ahead in the same lane, of columns (rows,), x in m; `NOBODY` where none is."""
+    """Return the nearest vehicles ahead in the same lane, of columns (rows,), x in m; `NOBODY` if none is."""
     group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
     order = np.lexsort([x, lane, frame, group])
     same = np.logical_and.reduce([np.diff(values[order]) == 0 for values in (lane, frame, group)])

@@ -1,4 +1,4 @@
-"""Fit: base distributions of scenarios from recorded traffic."""
+"""Fit: traffic models of scenarios from recorded traffic."""
 
 from training.fit.base import fit_base
 from training.fit.filters import EventSet

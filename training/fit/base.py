@@ -1,4 +1,4 @@
-"""Base distributions fitted to events, with all that says what they are worth, as the text of a base file."""
+"""Traffic models fitted to events, with all that says what they are worth, as the text of a base file."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def fit_base(
         source: Site, data, publisher, licence and so on, for the file.
         command: Command that writes the file.
         neighbours: Of cut-ins, on whom those come who do not look: at random times; or a base made of strata, whose
-            `unseen` is taken where there are none. None for one density of all cut-ins.
-        frequency: How often the events happen; None where nobody counted.
+            `unseen` is taken if there are none. None for one density of all cut-ins.
+        frequency: How often the events happen; None if nobody counted.
         system: Name of the coordinate system, columns apart left out; None for the one that the events support best.
         n_refits: Number of refits; None for 30, or 100 where families differ among these.
         seed: Seed of the fits.
@@ -155,7 +155,7 @@ def _compare_systems(
 
 
 def _describe_fit(fit: SystemFit, scores: FloatArray) -> dict[str, Any]:
-    """Return the criteria of one coordinate system; null where too few events were left to predict from."""
+    """Return the criteria of one coordinate system; null if too few events were left to predict from."""
     return {
         "coordinates": fit.system.name,
         "bic": round(fit.bic, 2),

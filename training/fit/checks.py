@@ -113,7 +113,7 @@ def simulate_answers(starts: FloatArray, draws: int = DRAWS, seed: int = 0) -> F
         seed: Of the draws.
 
     Returns:
-        Shape (draws, n, 2, 2): follower and cutter; mean acceleration and hardest braking [m/s^2], 0 where none.
+        Shape (draws, n, 2, 2): follower and cutter; mean acceleration and hardest braking [m/s^2], 0 if none.
 
     Example:
         >>> answers = simulate_answers(np.array([[20.0, 12.0, 12.0, 10.0, 40.0]]), draws=2)
@@ -144,12 +144,12 @@ def check_answers(starts: FloatArray, recorded: FloatArray) -> dict[str, dict[st
 
     Args:
         starts: As of `simulate_answers`, (n, 5).
-        recorded: What was recorded of them, (n, 2, 2), NaN where it was not.
+        recorded: What was recorded of them, (n, 2, 2), NaN if it was not.
 
     Returns:
         By vehicles their number, recorded and simulated mean and the root mean square error of the mean acceleration
         over 2 s [m/s^2], and where it is known the recorded number and the simulated share of those who brake harder
-        than 3.4 m/s^2 within 3 s, with the number of recorded ones. Empty where nothing was recorded.
+        than 3.4 m/s^2 within 3 s, with the number of recorded ones. Empty if nothing was recorded.
     """
     found: dict[str, dict[str, float]] = {}
     known = np.flatnonzero(np.isfinite(recorded[:, :, 0]).any(axis=1))

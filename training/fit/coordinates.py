@@ -38,13 +38,13 @@ class CoordinateSystem:
     name: str
     """Short name for messages and tables, such as "log gap"."""
     kinds: Mapping[str, CoordinateKind] = field(default_factory=dict)
-    """Kind of the coordinate by parameter; plain where none is given."""
+    """Kind of the coordinate by parameter; plain if none is given."""
     order: tuple[str, ...] = ()
     """Parameters in the order of the coordinates; that of x if empty."""
     within: tuple[Difference, ...] = ()
     """Ranges of differences of parameters."""
     origins: Mapping[str, float] = field(default_factory=dict)
-    """What is subtracted from a parameter whose logarithm is its coordinate; 0 where nothing is given."""
+    """What is subtracted from a parameter whose logarithm is its coordinate; 0 if nothing is given."""
 
     def coordinates(self, parameters: Sequence[Parameter]) -> Coordinates:
         """Return the coordinates of these first parameters of the scenario."""
@@ -148,7 +148,7 @@ def _fit_in(
 def held_out_log_prob(
     events: EventSet, system: CoordinateSystem, parameters: Sequence[Parameter], seed: int = 0
 ) -> FloatArray:
-    """Return the log density of each event (n,) under a fit to the other folds of clusters; NaN where too few."""
+    """Return the log density of each event (n,) under a fit to the other folds of clusters; NaN if too few."""
     names = np.random.default_rng(seed).permutation(np.unique(events.clusters))
     own = parameters[: events.joint.shape[1]]
     scores = np.full(len(events.joint), np.nan)
@@ -165,7 +165,7 @@ def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters
     """Return which coordinate system is supported best, of BICs and log densities of held-out events, (n,) each.
 
     The one with the least BIC among those whose held-out log likelihood is not clearly worse than the best one's:
-    by no more than `CLEARLY_WORSE` paired standard errors, of sums over clusters (n,). Where others are within
+    by no more than `CLEARLY_WORSE` paired standard errors, of sums over clusters (n,). If others are within
     `BIC_TIE` of it, the held-out log likelihood decides between these.
     """
     known = np.isfinite(np.stack(held_out)).all(axis=0)

@@ -1,4 +1,4 @@
-"""Filters of events: columns of events files, and the conditions on events that a base distribution is fitted to."""
+"""Filters of events: columns of events files, and the conditions on events that a traffic model is fitted to."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class EventSet:
     log: tuple[Mapping[str, Any], ...] = ()
     """What each filter dropped, see `filter_events`."""
     answers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """What was recorded after each event of the columns fitted together, (n, b); NaN where it was not."""
+    """What was recorded after each event of the columns fitted together, (n, b); NaN if it was not."""
 
     @property
     def counts(self) -> EventCounts:
@@ -98,7 +98,7 @@ EVENT_DEFINITIONS = {
 FILTER_REASONS = {
     "missing": "no ego behind or no lead ahead was recorded, so the parameter has no value",
     "not at_entry": "the pair was there when the ego came into the picture: following under way, no new leader",
-    "start_seen": "the track began during the lane change: speeds and gaps are as good as any, but the vehicle had "
+    "start_seen": "the track began during the lane change: speeds and gaps are valid, but the vehicle had "
     "already moved across",
     "m/s": "outside the physical range of speeds",
     "m": "outside the physical range: gaps below it are side by side or errors of position and "
@@ -138,7 +138,7 @@ def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]
 
 
 def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
-    """Return the columns of an events file, numbers as float64 with NaN where a value is missing."""
+    """Return the columns of an events file, numbers as float64 with NaN if a value is missing."""
     others = (*recipe.required, *recipe.excluded, *recipe.where, *recipe.cluster)
     numbers = (*recipe.columns, *recipe.answers)
     events = read_csv_columns(path, (*numbers, *others))

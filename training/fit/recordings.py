@@ -1,4 +1,4 @@
-"""Base distributions fitted to recorded traffic, written as JSON: what `rare-envs fit` does.
+"""Traffic models fitted to recorded traffic, written as JSON: what `rare-envs fit` does.
 
 Events of car-following, cut-in and hard brake are extracted from recordings in any of the formats of docs/data.md,
 filtered, and fitted with Gaussian mixtures with full covariances. The events choose the number of components (by the
@@ -101,7 +101,7 @@ def observe_traffic(table: Trajectories) -> FloatArray:
 
 
 def count_events(scenario: str, events: Events, used: int, traffic: FloatArray) -> EventFrequency | None:
-    """Return the frequency of events of a user's own recordings; None where nothing was recorded to count.
+    """Return the frequency of events of a user's own recordings; None if nothing was recorded to count.
 
     Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
     Car-following: pairs that begin while the ego is in the picture already, times the share that the filters keep.
@@ -228,7 +228,7 @@ def fit_bases(
     progress: bool = False,
     force: bool = False,
 ) -> list[Path]:
-    """Fit base distributions to recordings, or those of the package to its events; return their files in a folder.
+    """Fit traffic models to recordings, or those of the package to its events; return their files in a folder.
 
     None of the scenarios stands for all that have enough events; the others are left out with a line on standard error,
     unless there is none. A ValueError or an OSError says which argument, file or recording is wrong; `force` replaces

@@ -189,7 +189,7 @@ def fit_cut_in(
 ) -> Fit:
     """Return cut-ins of `CutIn-v1` with both strata.
 
-    The events are starts of recorded cut-ins, with offset and duration apart. Where nobody counted how frequent they
+    The events are starts of recorded cut-ins, with offset and duration apart. If nobody counted how frequent they
     are, the share of those who do not look is that of US 101's. A ValueError if the events are too few.
     """
     check_starts(events)

@@ -89,7 +89,7 @@ def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, 
 class Behaviour(NamedTuple):
     """Motion and contacts of n vehicles, of a scene each (n,), in T ticks: shapes (T, n).
 
-    `known` is True where a vehicle is there and counts; elsewhere its other values mean nothing. Units are m/s, m/s^2
+    `known` is True if a vehicle is there and counts; elsewhere its other values mean nothing. Units are m/s, m/s^2
     and rad/s; `ahead` and `rate` are the range [m] and range rate [m/s] of the beam ahead. `contact` is True where its
     body overlaps with another that it did not overlap with at the start, `off_road` where its middle is beyond the edge
     of the road, `changed` where its lane differs from that of the tick before.

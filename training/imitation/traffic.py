@@ -24,7 +24,7 @@ PARKING_X, PARKING_GAP = -1e4, 300.0
 class Recording(NamedTuple):
     """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `TrafficScene`.
 
-    The first eight have shape (S, T, V): `present` is True where a vehicle is recorded, `acts` where its acceleration
+    The first eight have shape (S, T, V): `present` is True if a vehicle is recorded, `acts` where its acceleration
     and yaw rate are known; the others are 0 where it is absent. Sizes have shape (S, V). Lane boundaries, left to right
     (S, L + 1), repeat the last edge beyond the last lane. `ticks` is the number of ticks of each scene (S,).
     """

@@ -264,7 +264,7 @@ def _read_i24_leaders(folder: Path) -> Read:
 def find_new_leaders(speed: FloatArray, relative_speed: FloatArray, gap: FloatArray) -> FloatArray:
     """Return own speed, speed ahead and gap [m/s, m/s, m] of new leaders once tracked, (n, 3), of columns (T,).
 
-    The relative speed is that ahead less the own, NaN where it is not known; the gap is NaN where nobody is.
+    The relative speed is that ahead less the own, NaN where it is not known; the gap is NaN if nobody is.
     """
     filled = np.where(np.isnan(gap), NO_LEADER, gap)
     jumps = np.abs(filled[JUMP_TICKS:] - filled[:-JUMP_TICKS]) > MIN_JUMP
@@ -307,7 +307,7 @@ def read_lane_changes(folder: Path, site: str) -> FloatArray:
     One table for each site, since two of US 101 may hold the same changes: of I-80 the 165 changes that were smoothed
     and cut out by their author, of US 101 the 302 of single vehicles that stay 3 s or more in one lane on either side.
     The displacement is that of the changing vehicle, of US 101 between 4 s before and after the crossing, 3 s where the
-    track is shorter. NaN where a value is not known.
+    track is shorter. NaN if a value is not known.
     """
     above, displacement = (_us101_changes if site == "us101" else _i80_changes)(folder)
     return np.column_stack([displacement, course_durations(above, displacement)])

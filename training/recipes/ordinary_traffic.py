@@ -258,7 +258,7 @@ def _lane_margin(state: State, first: Episode) -> Tensor:
 
 
 def _blame(episode: Episode) -> Tensor:
-    """Return `COLLIDED` where the ego ran into something, `HIT_BY_OTHER` where a vehicle ran into it."""
+    """Return `COLLIDED` if the ego ran into something, `HIT_BY_OTHER` where a vehicle ran into it."""
     assert episode.statistics is not None
     crash = episode.statistics.own
     own = (crash.vehicles[:, 0] == 0) | (crash.kind == ROAD_EDGE)
@@ -266,7 +266,7 @@ def _blame(episode: Episode) -> Tensor:
 
 
 def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, Any]]:
-    """Return rollouts passed and judged, the lower end of a 95 % interval, and the other verdicts, for each case."""
+    """Return rollouts passed and judged, the lower limit of a 95 % interval, and the other verdicts, for each case."""
     found = {}
     for case in CASES:
         counts = Counter(VERDICT_NAMES[k] for k in judge(ego, case, rollouts, seed).reason.tolist())

@@ -182,7 +182,7 @@ def start_situation(situation: Situation, rows: int, seconds: float, rng: np.ran
 
 
 def _draw_weather(n: int, rng: np.random.Generator) -> Array:
-    """Draw weather: half of the days are clear; on the others the fog is thicker than in the base distribution."""
+    """Draw weather: half of the days are clear; on the others the fog is thicker than in the traffic model."""
     fog = np.exp(rng.uniform(math.log(5e-5), math.log(1e-2), (n, 1)))
     some = np.concatenate((fog, SUN_DISTRIBUTION.sample(n, rng), SENSOR_NOISE_DISTRIBUTION.sample(n, rng)), axis=1)
     clear = np.array([CLEAR[0], math.degrees(CLEAR[1]), math.degrees(CLEAR[2]), 0.0])

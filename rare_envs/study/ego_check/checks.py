@@ -192,9 +192,9 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
 
         return map_kinds(of, probe.seen, boxes)
 
-    cases = {"zeros": probe.change_seen(np.zeros_like), "the lower end": fill("low", -1.0)}
+    cases = {"zeros": probe.change_seen(np.zeros_like), "the lower bound": fill("low", -1.0)}
     bad = []
-    for name, case in (cases | {"the upper end": fill("high", 1.0)}).items():
+    for name, case in (cases | {"the upper bound": fill("high", 1.0)}).items():
         try:
             bad += [] if np.isfinite(probe.act(case)).all() else [f"{name}: NaN or infinite"]
         except Exception as error:
@@ -306,7 +306,7 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
     f = evaluator.evaluate(probe.problem.base.sample(BATCH_ROWS, np.random.default_rng(2)))
     if evaluator.faults:
         failed = f"fails on {len(evaluator.faults)} of {BATCH_ROWS} ordinary scenarios: {evaluator.faults[0].reason}"
-        advice = "mend it, or count such scenarios with --on-error failure or bound"
+        advice = "fix it, or count such scenarios with --on-error failure or bound"
         yield Finding("driving", "fail", failed, advice)
         return
     crashed = float((f == -1.0).mean())

@@ -41,7 +41,7 @@ __all__ = ["write_html_report"]
 BROKEN_NUMBER = re.compile(r"(?<=\d) (?=%|× 10)|(?<=×) (?=10)")
 """Spaces within a number: "0.12 %", "3.1 × 10⁻⁵"."""
 SIZED_BY_BUDGET = ("mc", "is", "two-stage", "series", "surrogate")
-"""Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
+"""Methods whose setting n is their budget if max_sim does not say; the n of others is that of a level."""
 
 
 class NearestEvent(NamedTuple):
@@ -297,7 +297,7 @@ def _make_figures(study: LoadedStudy, problem: DrivingProblem) -> dict[str, Figu
 
 
 def _read_failing(study: LoadedStudy, names: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Return the failing simulations, the columns asked for (k, m) and log weights (k,), NaN where there is none."""
+    """Return the failing simulations, the columns asked for (k, m) and log weights (k,), NaN if there is none."""
     if not (study.folder / EPISODES).exists():
         table = [np.asarray(study.failures[name], dtype=float) for name in names if name in study.failures]
         x = np.column_stack(table) if len(table) == len(names) else np.empty((0, len(names)))

@@ -1,4 +1,4 @@
-"""Base distributions of scenarios: by name, from a file, as a dictionary or an object, and what does not fit."""
+"""Traffic models of scenarios: by name, from a file, as a dictionary or an object, and what does not fit."""
 
 import json
 from dataclasses import replace
@@ -120,7 +120,7 @@ def test_files_that_are_no_base(tmp_path: Path) -> None:
         ("us11", r"'us11' for cut_in \(did you mean 'us101'\?\): neither one of us101,.* nor a"),
         (tmp_path, "nor a file"),
         (broken, "broken.json is not valid JSON"),
-        (binary, "Cannot read the base distribution"),
+        (binary, "Cannot read the traffic model"),
         (write(tmp_path / "list.json", [1]), "expected a JSON object, got list"),
     ]:
         with pytest.raises(ValueError, match=message) as caught:
@@ -149,7 +149,7 @@ def test_a_fitted_file_has_refits_and_knows_the_other_bases(tmp_path: Path) -> N
     assert (base.log_prob(x) == shipped.log_prob(x)).all()
     assert (base.refits[0].log_prob(x) == shipped.log_prob(x)).all()
     assert (base.sibling(next(iter(FOLLOWING.bases))).log_prob(x) == shipped.log_prob(x)).all()
-    with pytest.raises(ValueError, match=r"No base distribution 'us11' for car_following \(did you mean 'us101'"):
+    with pytest.raises(ValueError, match=r"No traffic model 'us11' for car_following \(did you mean 'us101'"):
         base.sibling("us11")
 
 
@@ -182,7 +182,7 @@ class Complete(Draws):
 @pytest.mark.parametrize(
     ("base", "message"),
     [
-        (3, "A base distribution must be one of us101, .*, a path .*; got int without sample, log_prob, to_stand"),
+        (3, "A traffic model must be one of us101, .*, a path .*; got int without sample, log_prob, to_stand"),
         (Draws(np.zeros((1, 3))), r"; got Draws without log_prob, to_standard_normal, from_standard_normal\.$"),
         (Complete(np.zeros((1, 6))), r"shape \(1000, 3\), one column for each of ego_.*, gap; got \(1000, 6\)\.$"),
         (Complete(np.array([[20.0, 45.1, 30.0]])), r"not fit car_following: it draws lead_speed outside \[0, 45\] m/s"),

@@ -41,7 +41,7 @@ SPEED = Parameter("speed", "m/s", 5.0, 30.0, "")
         ({"vehicle_names": ("car", "stalled")}, 'vehicles with different names, "ego" first'),
         ({"vehicle_names": ("ego", "")}, "vehicles with names, got ('ego', '')"),
         ({"labels": ("the ego",)}, "as many labels as vehicles"),
-        ({"bases": {}}, "at least one base distribution"),
+        ({"bases": {}}, "at least one traffic model"),
         ({"horizon": math.inf}, "a horizon in s"),
         ({"parameters": (SPEED, SPEED)}, "parameters with different names, none of them 'x'"),
         ({"parameters": (replace(SPEED, name="x"),)}, "parameters with different names, none of them 'x'"),
@@ -108,7 +108,7 @@ def without_a_value(function: Callable[..., Any], field: str) -> Callable[..., A
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"bases": {"odd": {"weights": [1.0]}}}, "^Base distribution odd: Missing means, covariances"),
+        ({"bases": {"odd": {"weights": [1.0]}}}, "^Traffic model odd: Missing means, covariances"),
         ({"initial": lambda x: None}, r"expected initial\(x\) to give a State, got NoneType\.$"),
         ({"initial": lambda x: initial(x)._replace(theta=x[:3])}, r"expected theta of 8 rows, got \(3, 2\)\.$"),
         ({"vehicle_names": ("ego", "a", "b"), "labels": ()}, r"x of shape \(B, 3\) from initial\(x\), got \(8, 2\)"),
@@ -125,7 +125,7 @@ def test_what_does_not_work_is_refused(change: dict[str, Any], message: str) -> 
     scenario: Scenario = replace(STANDING, **change)
     with pytest.raises(ValueError, match=message) as caught:
         try_scenario(scenario)
-    assert str(caught.value).startswith(("Scenario 'standing': ", "Base distribution "))
+    assert str(caught.value).startswith(("Scenario 'standing': ", "Traffic model "))
 
 
 with warnings.catch_warnings():
