@@ -154,7 +154,7 @@ def test_nobody_else_takes_the_journal(asked: Question) -> None:
     heads: list[tuple[dict[str, Any], str]] = [
         ({"question": asdict(replace(asked, seed=4))}, "asks for other points"),
         ({"version": "9.0"}, r"begun by version 9\.0"),
-        *(({"question": other}, "Cannot take up") for other in ({"env": 1}, None, [1])),
+        *(({"question": other}, "Cannot resume") for other in ({"env": 1}, None, [1])),
     ]
     for head, said in heads:
         journal.write_bytes(content)
