@@ -31,8 +31,7 @@ TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and any code in it 
 """Consequence of trust=True."""
 TRUST_ADVICE = (
     "others may have put something else there: copy it to a folder of your own, or take away their right to write "
-    f"(chmod o-w). With --trust (trust=True) it is opened nevertheless; mind that {TRUST_CONSEQUENCE}, "
-    "where otherwise only what is known to be harmless is made of it"
+    f"(chmod o-w). --trust (trust=True) opens it all the same: {TRUST_CONSEQUENCE}"
 )
 """Advice on a risk."""
 

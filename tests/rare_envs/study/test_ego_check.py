@@ -245,7 +245,7 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
         assert (said.exit_code, said.stdout) == (2, "")
         assert f"Will not open it: {doubt}; {finding['advice']}." in said.stderr
     with pytest.raises(
-        ValueError, match=r"is writable by everybody.*copy it to a folder of your own.*code is in it runs"
+        ValueError, match=r"is writable by everybody.*copy it to a folder of your own.*any code in it runs"
     ):
         agents.load_ego(saved)
 
