@@ -278,11 +278,11 @@ def risk(
     force: bool = False,
     **options: Any,
 ) -> Risk:
-    """Estimate the collisions of an ego per million km, with an interval that holds what is not known of traffic.
+    """Estimate the collisions of an ego per million km, with an interval that includes what is not known of traffic.
 
-    Each scenario's p is multiplied by the frequency of its events, and the products are added. The interval includes the
-    errors of the counted events, of the fitted traffic models and of the simulations; with several `sites` also
-    the spread between them. All holds for an ego that takes over at the moment of each event. A policy whose
+    Each scenario's p is multiplied by the frequency of its events, and the products are added. The interval includes
+    the errors of the counted events, of the fitted traffic models and of the simulations; with several `sites` also
+    the spread between them. All is so for an ego that takes over at the moment of each event. A policy whose
     observations or actions do not fit one of the scenarios is evaluated in the others, with a warning.
 
     Args:
