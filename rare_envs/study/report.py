@@ -45,9 +45,7 @@ COLLISION_MEASURE = "ttc"
 """The measure to advise: -1 after a collision and above 0 without one."""
 MODEL_NOUN = "traffic model"
 """What a traffic model of scenarios is called."""
-ENSEMBLE_REASON = (
-    "the parameters of an ensemble are those of all its refits; without --ensemble there are derivatives"
-)
+ENSEMBLE_REASON = "the parameters of an ensemble are those of all its refits; without --ensemble there are derivatives"
 """Why there are no derivatives of the mean over refits."""
 
 
