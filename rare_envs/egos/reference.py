@@ -1,9 +1,11 @@
 """Reference drivers as egos: the competent and careful human and the ALKS of UN Regulation 157, FSM and RSS.
 
 Each says which vehicles it notices and how hard it wants to brake for them. It brakes a reaction time after a danger
-began, with limited jerk, and for as long as there is one. The equations speak of emergencies alone. Between these a
-driver keeps its initial speed and follows by the improved IDM (`rare_envs.control.idm`), a reaction time late and by at
-most 4 m/s^2; `cruise=False` is without, as the published comparisons are. It keeps its lane. All is deterministic.
+began, with limited jerk, for as long as there is one; later in the episode it is alert and brakes at once. These are
+equations of emergencies. Between them a driver keeps its initial speed and follows by the improved IDM
+(`rare_envs.control.idm`), a reaction time late and by at most 4 m/s^2; `cruise=False` is without, as the published
+comparisons are. It keeps its lane. All is deterministic. `benchmarks.driving.reference_grid` has the Regulation's
+cut-ins beside the verdicts of the JRC's code.
 
 References:
     UN Regulation 157 (ALKS), 2021, paragraph 5.2.5 and annex 4, appendix 3. The text was not consulted: values are
@@ -44,7 +46,11 @@ SLOWEST = 1.0
 
 
 class Scene(NamedTuple):
-    """What B drivers see of V other vehicles, (B, V) each unless said otherwise."""
+    """What B drivers see of V other vehicles, (B, V) each unless said otherwise.
+
+    Places are those after the tick: its motion is that of the present speeds, whatever is decided, and what is decided
+    shows in the speeds after it. So the JRC's code has it.
+    """
 
     gap: Tensor
     """Bumper to bumper along the road [m], negative side by side."""
@@ -289,7 +295,7 @@ class _Memory(NamedTuple):
     noticed: Tensor
     """Ticks for which each vehicle has been noticed, forgotten as fast, int64, (B, V)."""
     waited: Tensor
-    """Ticks for which there has been a danger, forgotten as fast, int64, (B,)."""
+    """Ticks of danger so far, int64, (B,)."""
     acceleration: Tensor
     """The last one [m/s^2], (B,)."""
     planned: tuple[Tensor, ...]
@@ -331,8 +337,8 @@ class ReferenceDriver:
         return action, memory._replace(
             y=state.y[:, 1:],
             speeds=state.speed[:, 1:],
-            noticed=_count(memory.noticed, notices, evaluation),
-            waited=_count(memory.waited, danger, delay),
+            noticed=(memory.noticed + torch.where(notices, 1, -1)).clamp(0, 2 * evaluation),
+            waited=memory.waited + danger,
             acceleration=acceleration,
             planned=planned,
         )
@@ -345,21 +351,24 @@ class ReferenceDriver:
         known = (state.y[:, 1:] - lane).abs() <= episode.road.width / 2
         noticed = known.long() * _ticks(self.model.evaluation_time, self.world.clock.dt)
         kept = state.speed[:, 0].clamp_min(SLOWEST)
-        return _Memory(y, speed, noticed, torch.zeros_like(nothing, dtype=torch.int64), nothing, (), kept)
+        waited = torch.zeros_like(nothing, dtype=torch.int64)
+        return _Memory(y, speed, noticed, waited, nothing, (), kept)
 
     def _look(self, episode: Episode, memory: _Memory) -> tuple[Scene, Tensor]:
         """Return what there is to see, and which vehicles are ahead, by their centres, boolean (B, V)."""
         state, dt = episode.state, self.world.clock.dt
-        x, y, speed = state.x[:, 1:] - state.x[:, :1], state.y[:, 1:], state.speed[:, 1:]
-        across = y - state.y[:, :1]
+        own_y, own_speed = state.y[:, :1], state.speed[:, :1]
+        speed, moved = state.speed[:, 1:], state.y[:, 1:] - memory.y
+        along = speed * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
+        x, y = state.x[:, 1:] - state.x[:, :1] + (along - own_speed) * dt, state.y[:, 1:] + moved
         scene = Scene(
             gap=x - VEHICLE_LENGTH,
-            beside=across.abs() - VEHICLE_WIDTH,
-            offset=(y - episode.road.centre_of(state.y[:, :1])).abs(),
-            inward=(memory.y - y) * across.sign() / dt,
-            speed=speed * torch.cos(state.heading[:, 1:] - state.heading[:, :1]),
+            beside=(y - own_y).abs() - VEHICLE_WIDTH,
+            offset=(y - episode.road.centre_of(own_y)).abs(),
+            inward=-moved * (state.y[:, 1:] - own_y).sign() / dt,
+            speed=along,
             braking=(memory.speeds - speed) / dt,
-            own_speed=state.speed[:, :1],
+            own_speed=own_speed,
             own_acceleration=memory.acceleration[:, None],
             lane_width=episode.road.width,
             dt=dt,
@@ -381,11 +390,6 @@ class ReferenceDriver:
 def _ticks(time: float, dt: float) -> int:
     """Return the ticks after which a time [s] is over."""
     return math.ceil(time / dt - 1e-9)
-
-
-def _count(ticks: Tensor, on: Tensor, most: int) -> Tensor:
-    """Return counts of ticks one higher where `on` is set, else one lower, from 0 to twice `most`."""
-    return (ticks + torch.where(on, 1, -1)).clamp(0, 2 * most)
 
 
 @dataclass(frozen=True)

