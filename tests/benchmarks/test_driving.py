@@ -8,7 +8,7 @@ import torch
 
 import rare_envs
 import samplers
-from benchmarks.driving import egos, human_calibration
+from benchmarks.driving import egos, human_calibration, reference_grid
 from benchmarks.driving.egos import evaluate_ego, read_results, write_results
 from benchmarks.driving.human_calibration import (
     CALIBRATION_RESULT,
@@ -222,3 +222,12 @@ def test_the_table_and_the_ratio_of_the_arms():
     assert (middle, low, high) == pytest.approx((0.5, 0.5 * np.exp(-half), 0.5 * np.exp(half)))
     assert "| 0 | failures | 1 | 1.0e-04 (5.0e-05 to 2.0e-04) |" in format_rounds(rounds)
     assert "| 1,000, 900 | 0.250, 0.500 |" in format_rounds(rounds)
+
+
+@pytest.mark.parametrize("name", reference_grid.THEIRS)
+def test_the_recorded_verdicts_on_the_cut_ins_of_the_regulation_are_those_of_the_drivers(name: str) -> None:
+    """At the first cell in which only ours crashes it does; and where nobody is near, it does not."""
+    recorded = json.loads((reference_grid.RESULT).read_text())["drivers"][name]
+    cells = np.array([recorded["only ours crashes"]["cells with them"][0], [30.0, 20.0, 50.0, 1.2]])
+    assert reference_grid.find_ours(name, cells, cruise=False).tolist() == [True, False]
+    assert recorded["unpreventable with car following"] <= recorded["unpreventable"]
