@@ -112,7 +112,10 @@ class SavedEgo:
         if self.left_out is None:
             return ()
         why = "the ego's own file says that it was trained without VecNormalize"
-        return (f"{self.left_out} is not applied: {why}; --stats (load_ego(path, stats=FILE)) applies it",)
+        return (
+            f"{self.left_out} is not applied: {why}; stats: FILE in a file for --config, or "
+            "load_ego(path, stats=FILE), applies it",
+        )
 
     def find_normalisation_doubt(self, expected: Any) -> str:
         """Return what is wrong with its statistics for an environment's space of observations; "" if nothing seems."""

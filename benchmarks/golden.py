@@ -171,8 +171,7 @@ def serve(spec: Path) -> Iterator[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    served = "rare_envs serve-ego" if "serve-ego" in run_command("--help")[1] else "agents.remote"
-    command = [sys.executable, "-m", *served.split(), str(spec), "--bind", address]
+    command = [sys.executable, "-m", "agents.remote", str(spec), "--bind", address]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
@@ -332,23 +331,23 @@ def cases_of_observations(record: Record) -> Iterator[Case]:
 
 
 COMMANDS = """
-list; list egos; list bases; list CutIn-v0; list --json; bases cut_in; bases cut_in --json; bases nothing; --version
+list; list egos; list bases; list CutIn-v0; list --json; list cut_in; list cut_in --json; list nothing; --version
 bogus; list --bogus; estimate; estimate rare_envs/CutInn-v0; estimate rare_envs/CutIn-v0 --ego nobody
 estimate rare_envs/CutIn-v0 --ego missing.zip; estimate rare_envs/CutIn-v0 --method best
 estimate rare_envs/CutIn-v0 --measure tcc; estimate rare_envs/CutIn-v0 --base us102
 estimate rare_envs/CutIn-v0 --max-sim 0; estimate rare_envs/CutIn-v0 --max-sim many
-estimate rare_envs/CutIn-v0 --gamma nan; estimate rare_envs/CutIn-v0 --seed -1; estimate rare_envs/CutIn-v0 --core c
-estimate rare_envs/CutIn-v0 --on-error never; estimate rare_envs/CutIn-v0 --max-p 2; estimate x --config missing.yaml
-estimate rare_envs/CutIn-v0 --horizon -1; estimate rare_envs/CutIn-v0 --target-cov 0; estimate CutIn-v0 --workers 0
+estimate rare_envs/CutIn-v0 --gamma nan; estimate rare_envs/CutIn-v0 --seed -1
+estimate rare_envs/CutIn-v0 --max-p 2; estimate x --config missing.yaml
+estimate rare_envs/CutIn-v0 --target-cov 0; estimate CutIn-v0 --workers 0
 estimate rare_envs/CutIn-v0 --max-sim 3000 --out run --json; estimate rare_envs/CutIn-v0 --max-sim 3000 --out run
 estimate rare_envs/CutIn-v0 --max-sim 200 --method mc --out small --json
 estimate rare_envs/CutIn-v0 --max-sim 3000 --max-p 0.5; estimate rare_envs/CutIn-v0 --max-sim 3000 --max-p 1e-9
 estimate rare_envs/CutIn-v0 --max-sim 200 --method mc --max-p 1e-4 --json
-estimate rare_envs/CutIn-v0 --max-sim 3000 --ego {ppo} --details --also-under i80 --sensitivity --replicates 2
+estimate rare_envs/CutIn-v0 --max-sim 3000 --ego {ppo} --details
 estimate rare_envs/CutIn-v0 --config run.yaml --json; estimate rare_envs/CutIn-v0 --config wrong.yaml
 estimate rare_envs/CutIn-v0 --ego golden_ego:make_ego --method mc --gamma 1 --max-sim 400 --workers 2 --json
 estimate rare_envs/CutIn-v0 --ego golden_ego:nothing; estimate rare_envs/CutIn-v0 --max-sim 500 --observation lidarr
-estimate rare_envs/CarFollowing-v0 --max-sim 1000 --method adss --drivers gail --noise fixed --json
+estimate rare_envs/CarFollowing-v0 --max-sim 1000 --method adss --drivers gail --json
 estimate highway-fast-v0 --max-sim 20 --method mc --json; estimate rare_envs/Highway-v0 --max-sim 100 --method mc --json
 report run; report run --json; report nowhere; report run --figures bmp; replay run; replay run --failure 0 --json
 replay run --failure 100000; replay run --all; replay run --out worst.png; replay nowhere; resume run; resume nowhere
@@ -357,15 +356,15 @@ export run --out crash.xosc --format carla; export nowhere --out a.xosc; export 
 corpus add run; corpus add nowhere
 corpus run --ego idm; corpus run --ego imitation --junit corpus.xml; corpus run; corpus run --ego idm --corpus nowhere
 compare idm {ppo} rare_envs/CutIn-v0 --max-sim 4000 --json; compare idm rare_envs/CutIn-v0; compare idm nobody CutIn-v0
-compare idm {ppo} rare_envs/CutIn-v0 --max-sim 4000 --out compared; plan {ppo} rare_envs/CutIn-v0 --target-cov 0.1
-plan idm rare_envs/CutIn-v0 --cov 0; risk idm --max-sim 1000 --json; risk nobody; risk idm --sites us102
+compare idm {ppo} rare_envs/CutIn-v0 --max-sim 4000 --out compared; estimate CutIn-v0 --plan --target-cov 0.1
+estimate CutIn-v0 --plan --target-cov 0; risk idm --max-sim 1000 --json; risk nobody; risk idm --sites us102
 check-ego nobody CutIn-v0
 check-ego {ppo} rare_envs/CutIn-v0; check-ego {ppo} rare_envs/CutIn-v0 --json --all; check-ego {ppo} CutIn-v9
 check-ego {dqn} rare_envs/CutIn-v0 --observation lidar; check-ego idm rare_envs/CutIn-v0; check-ego {onnx} CutIn-v0
-export-ego {ppo} again.onnx; export-ego missing.zip a.onnx; export-ego {ppo}; fit --out bases; fit
+export {ppo} again.onnx; export missing.zip a.onnx; export {ppo}; fit --out bases; fit
 fit --out bases --highd nowhere; fit --out bases --data nowhere; train-ego; train-ego rare_envs/CutIn-v0 --algo pppo
 train-ego rare_envs/CutIn-v0 --steps 0 --out a.zip; train-ego rare_envs/CutIn-v0 --steps 512 --num-envs 16 --out a.zip
-train-ego --from-failures nowhere; serve-ego nobody; serve-ego {ppo} --bind nonsense; train-drivers --data nowhere
+train-ego --from-failures nowhere
 """
 
 
@@ -489,7 +488,7 @@ def prepare(record: Record) -> None:
         if not path.exists():
             run_command(f"train-ego {CUT_IN} --algo {algo} --steps {steps} --num-envs 64 --out {path}")
     if not (record.folder / "ppo.onnx").exists():
-        run_command(f"export-ego {record.folder / 'ppo.zip'} {record.folder / 'ppo.onnx'}")
+        run_command(f"export {record.folder / 'ppo.zip'} {record.folder / 'ppo.onnx'}")
 
 
 def main() -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, summarise_refits
+from samplers.analysis.gate import Verdict, find_doubt, judge_ends
 from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.weighted import (
     cov_inflation,
@@ -29,7 +30,7 @@ from samplers.output import (
     register_stored,
     to_json_value,
 )
-from samplers.problem import FloatArray, Problem, check_whole, names_of_columns, one_per_row
+from samplers.problem import FloatArray, Problem, check_number, check_whole, names_of_columns, one_per_row
 from samplers.replicate import UNRESOLVED_SHARE
 from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 MIN_SIDE_ESS = 30.0
 """Effective failing units below which a probability is called coarse: its c.o.v. is then about 0.2 or more."""
+RATIO_COARSE = "the ratio is imprecise"
+"""Words of the warnings that say how imprecise the ratio is, which its interval includes."""
 BASE_CHECK_DRAWS = 16
 """Draws at which the densities of the two base distributions are compared."""
 
@@ -94,6 +97,37 @@ class Comparison(Kept):
     """P[A or B fails], from which all this comes."""
     base_uncertainty: BaseUncertainty | None = None
     """The interval of the ratio that the events behind a fitted base allow; None for a base without refits."""
+
+    def meets(self, max_ratio: float, given_base: bool = False) -> Verdict:
+        """Return whether p_B / p_A is below a limit, so that B fails at most so many times as often as A.
+
+        Args:
+            max_ratio: The limit.
+            given_base: Take the base distribution as exact, as in `Estimate.meets`.
+
+        Raises:
+            ValueError: If the limit is not above 0.
+
+        Example:
+            >>> import samplers
+            >>> a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 3.2))
+            >>> print(samplers.compare(a, b, seed=1, max_sim=8000, confidence=0.9).meets(1.0).decision)
+            passes
+        """
+        check_number("max_ratio", max_ratio, 0.0, math.inf)
+        base, ends = None if given_base else self.base_uncertainty, self.interval
+        reason = find_doubt([each for each in self.warnings if RATIO_COARSE not in each])
+        reason = "no failure of A or B was found" if math.isnan(self.ratio) else reason
+        if base is not None:
+            ends = base.interval or (0.0, math.inf)
+            doubt = (
+                "" if base.interval else base.reason.rstrip(".") or "too few recordings for an interval of the ratio"
+            )
+            reason = reason or doubt or find_doubt(base.warnings)
+        low, high = (math.inf if end == 0 else 1.0 / end for end in reversed(ends))
+        if_exact = None if base is None else self.meets(max_ratio, True).decision
+        about: dict[str, Any] = {"includes_base": base is not None, "if_exact": if_exact, "quantity": "p_B / p_A"}
+        return judge_ends(max_ratio, (low, high), self.confidence, reason, **about)
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw p of A, of B and of both with their intervals, p on a log scale; needs matplotlib.
@@ -295,7 +329,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
         for name, s in (("A", a), ("B", b))
         if s.ess < MIN_SIDE_ESS
     ]
-    about = [f"{' and '.join(few)}: the ratio is imprecise; estimate each separately."] if few else []
+    about = [f"{' and '.join(few)}: {RATIO_COARSE}; estimate each separately."] if few else []
     for name, own, s in (("A", totals[0], a), ("B", totals[1], b)):
         most, where = _find_missed(own, totals, either)
         if most > UNRESOLVED_SHARE * s.p > 0:

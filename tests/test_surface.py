@@ -46,8 +46,7 @@ COMMANDS = {
     "train-ego": "--algo --steps --out --seed --num-envs --json",
     "check-ego": "--base --drivers --observation --action --json",
     "estimate": "--ego --method --base --measure --gamma --seed --max-sim --target-cov --max-p --workers --out --force "
-    "--json --details --config --noise --drivers --observation --action --horizon --algo --stats "
-    "--on-error --replicates",
+    "--json --details --config --drivers --observation --action --plan --confidence --max-rate",
     "risk": "--method --max-sim --seed --out --json",
     "compare": "--method --max-sim --seed --out --json",
     "resume": "--workers --json",
@@ -280,10 +279,10 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that used most options."""
     folder = tmp_path_factory.mktemp("study") / "run"
     config = folder.with_name("run.yaml")
-    config.write_text(f"env: {CUT_IN}\nmethod: mc\ngamma: 0.5\n")
+    config.write_text(f"env: {CUT_IN}\nmethod: mc\ngamma: 0.5\ncore: torch\n")
     code, out, err = run(
         *f"estimate --ego idm --base us101 --measure ttc --seed 1 --max-sim 3000 --workers 1 --out {folder} --force "
-        f"--core torch --json --details --config {config} --max-p 0.9 --assume-traffic".split()
+        f"--json --details --config {config} --max-p 0.9 --assume-traffic".split()
     )
     assert code == 0 and 0 < json.loads(out)["p"] < 0.9, err
     return folder
@@ -295,7 +294,7 @@ def test_a_run_is_replayed_exported_and_kept(study: Path, tmp_path: Path) -> Non
     for form, name in (("openscenario", "crash.xosc"), ("carla", "carla.xosc"), ("commonroad", "crash.xml")):
         assert run("export", study, "--out", tmp_path / name, "--format", form)[0] == 0
         assert (tmp_path / name).stat().st_size
-    assert run("corpus", "add", study, "--corpus", tmp_path / "corpus", "--most", 2)[0] == 0
+    assert run("corpus", "add", study, "--corpus", tmp_path / "corpus", "--limit", 2)[0] == 0
     assert run("corpus", "run", "--ego", "idm", "--corpus", tmp_path / "corpus")[0] in (0, 4)
     assert rare_envs.load_study(study)
 

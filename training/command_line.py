@@ -6,31 +6,34 @@ parameter, annotated with a dataclass; `spread_options` puts the fields of the c
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import functools
 import inspect
+import itertools
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_type_hints
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 import typer
 
-RunFolderOption = Annotated[Path, typer.Option(help="Folder; a training that was stopped in it continues.")]
-LocationOption = Annotated[str | None, typer.Option(help="Location, where an NGSIM file has several.")]
+RunFolderOption = Annotated[Path, typer.Option(help="Folder of the training; one that was stopped in it is continued.")]
+LocationOption = Annotated[str | None, typer.Option(help="Location, if an NGSIM file has several.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
     """Options that name recorded traffic, of which one is given."""
 
-    data: Annotated[Path | None, typer.Option(help="Folder with the files of US 101: compact tables, or events.")] = (
+    data: Annotated[Path | None, typer.Option(help="Folder with the files of US 101 (compact tables, or events).")] = (
         None
     )
-    ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None
-    highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None
-    tgsim: Annotated[Path | None, typer.Option(help="Or a file of TGSIM, or a folder with several.")] = None
-    i24: Annotated[Path | None, typer.Option(help="Or a JSON file of I-24 MOTION, unpacked.")] = None
+    ngsim: Annotated[Path | None, typer.Option(help="Raw NGSIM file (CSV or text).")] = None
+    highd: Annotated[Path | None, typer.Option(help="Folder with the files of highD.")] = None
+    tgsim: Annotated[Path | None, typer.Option(help="File of TGSIM, or a folder with several.")] = None
+    i24: Annotated[Path | None, typer.Option(help="JSON file of I-24 MOTION, unpacked.")] = None
 
     KINDS: ClassVar[tuple[str, ...]] = ("data", "ngsim", "highd", "tgsim", "i24")
     """Names of the options."""
@@ -48,23 +51,13 @@ class RecordingOptions:
 class EventOptions(RecordingOptions):
     """Options that name recordings of which events are extracted."""
 
-    coifman: Annotated[Path | None, typer.Option(help="Or the I-80 data of Coifman and Li, .mat or text.")] = None
+    coifman: Annotated[Path | None, typer.Option(help="I-80 data of Coifman and Li (.mat or text).")] = None
     location: LocationOption = None
     between: Annotated[
-        tuple[float, float] | None, typer.Option(help="Of I-24 MOTION: first and last Unix time to read [s].")
+        tuple[float, float] | None, typer.Option(help="First and last Unix time to read of I-24 MOTION [s].")
     ] = None
 
     KINDS: ClassVar[tuple[str, ...]] = (*RecordingOptions.KINDS, "coifman")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriverTrainingOptions:
-    """Options of each command that trains drivers: with the defaults of `Config`, which takes seconds to import."""
-
-    method: Annotated[Literal["gail", "mgail"], typer.Option(help="Algorithm.")] = "mgail"
-    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = 0
-    updates: Annotated[int, typer.Option(min=1, help="Updates of the policy, after behaviour cloning.")] = 1500
-    device: Annotated[str, typer.Option(help="Where to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu"
 
 
 @contextlib.contextmanager
@@ -82,7 +75,8 @@ def report_errors(program: str) -> Iterator[None]:
 
 def run_command(command: Callable[..., None]) -> None:
     """Run a function as the program, its parameters as options and its docstring as help, and end the process."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    about: dict[str, Any] = {"context_settings": {"max_content_width": 120}, "rich_markup_mode": None}
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, **about)
     app.command()(command)
     app()
 
@@ -96,6 +90,9 @@ def spread_options(command: Callable[..., None]) -> Callable[..., None]:
         if isinstance(group, type) and is_dataclass(group):
             groups[name] = group
             hints = get_type_hints(group, include_extras=True)  # each in the module of the class that has the field
+            hints |= {
+                field: Annotated[hints[field], typer.Option(help=text)] for field, text in _read_docs(group).items()
+            }
             options = inspect.signature(group).parameters.values()
             parameters += [option.replace(annotation=hints[option.name]) for option in options]
         else:
@@ -116,3 +113,15 @@ def spread_options(command: Callable[..., None]) -> Callable[..., None]:
     spread.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     del spread.__wrapped__
     return spread
+
+
+def _read_docs(group: type[Any]) -> dict[str, str]:
+    """Return the docstrings of the fields of a class, in one line each."""
+    (body,) = ast.parse(inspect.getsource(group)).body
+    assert isinstance(body, ast.ClassDef)
+    found = {}
+    for field, after in itertools.pairwise(body.body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(after, ast.Expr):
+            text = ast.literal_eval(after.value)
+            found[field.target.id] = re.sub(r"\s+", " ", text).replace("`", "")
+    return {name: text for name, text in found.items() if name != "KINDS"}

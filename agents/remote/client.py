@@ -175,7 +175,9 @@ class ProcessLink(ServerLink):
         """Make a link; `open` starts the process. Arguments are those of `agents.load_ego`, which is called there."""
         super().__init__(f"process:{spec}")
         if os.name != "posix":
-            raise ValueError("Expected Linux or macOS for process:EGO, whose socket is a file; use serve-ego.")
+            raise ValueError(
+                "Expected Linux or macOS for process:EGO, whose socket is a file; use python -m agents.remote."
+            )
         self._arguments = json.dumps({"spec": spec, **how}, default=str)
 
     def _attach(self, link: Socket) -> None:

@@ -1,4 +1,4 @@
-// A client in JavaScript, without any package: asks an ego that rare-envs serve-ego lends for a few actions.
+// A client in JavaScript, without any package: asks an ego that python -m agents.remote serves for a few actions.
 // node client.mjs PORT FEATURES [BATCH]; FEATURES is how many numbers to show it if it does not say what it observes.
 import net from "node:net";
 import { pack, unpack } from "./msgpack.mjs";

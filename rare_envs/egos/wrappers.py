@@ -137,7 +137,8 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
 
 
 STATS_ADVICE = (
-    "name their file (--stats, load_ego(path, stats=FILE)), or hand in an ego that normalises before it predicts"
+    "name their file (stats: FILE in a file for --config, load_ego(path, stats=FILE)), or hand in an ego that "
+    "normalises before it predicts"
 )
 """What to do about statistics that are missing or of another policy."""
 

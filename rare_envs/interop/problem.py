@@ -72,7 +72,8 @@ def make_policy(ego: Any, env: gym.Env[Any, Any]) -> Any:
         if expected is not None and not (fits and getattr(expected, "n", None) == getattr(given, "n", None)):
             raise ValueError(
                 f"The ego was made for {what}s {expected}, the environment has {given}; give the environment the "
-                "config that the ego was trained with: highway_env_problem(..., config={...}), or --env-config FILE."
+                "config that the ego was trained with: highway_env_problem(..., config={...}), or env_config: FILE in "
+                "a file for --config."
             )
     return wrap_policy(policy, env.observation_space)
 

@@ -14,7 +14,7 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -169,58 +169,74 @@ class Question:
         (3.0, 'auto')
     """
 
-    env_id: str = field(metadata={"help": "Environment, such as rare_envs/CutIn-v0.", "option": "env"})
-    base: str | None = arg(None, "Base distribution: a name or a JSON file.")
+    env_id: str = field(
+        metadata={"help": "Scenario: CutIn, cut-in and rare_envs/CutIn-v1 are the same.", "option": "env"}
+    )
+    base: str | None = arg(None, "Traffic model: a name of rare-envs list SCENARIO, or a JSON file of rare-envs fit.")
     drivers: str | None = arg(
-        None, "Of the vehicles around: mgail, mgail?rules=0, gail, idm, idm+mobil, a file, or cutter=POLICY.zip."
+        None, "Driver model of surrounding vehicles: mgail, gail, idm, idm+mobil, a file, or cutter=POLICY.zip."
     )
     observation: str | None = arg(
         None,
-        "Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
-        "one that the ego's space fits.",
+        "Observation of the ego: features, lidar, kinematics, camera, speed or camera+lidar; by default the one that "
+        "fits its observation space.",
     )
     action: str | None = arg(
         None,
-        "Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second; by default "
-        "those that its space fits.",
+        "Actions of the ego: continuous or discrete (each tick), or HighwayEnv's meta (each second); by default those "
+        "that fit its action space.",
     )
     horizon: float | None = arg(None, "Length of an episode in seconds.")
-    noise: bool | str = arg(True, "The drivers' noise: part of x, one fixed sequence, none.")
-    weather: bool = arg(False, "Make weather and the camera's noise parameters.")
+    noise: bool | str = arg(
+        True, "Noise of the drivers: on (part of the scenario), fixed (the same in every scenario) or off."
+    )
+    weather: bool = arg(False, "Make weather and the noise of the camera part of the scenario.")
     method: str = arg("auto", "Estimation method (see rare-envs list methods), or module:Class.")
     measure: str = arg("ttc", "Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
-    gamma: float = arg(0.0, "Threshold: P[f <= gamma]; 0 counts collisions.")
-    seed: int = arg(0, "Seed; the same seed gives the same answer.", count=True)
-    collisions: str = arg("ego", "Which count: ego, or any, between others too.")
-    device: str = arg(
-        "cpu", "Where torch simulates: cpu, or a GPU (cuda, cuda:1), which leaves numba out: docs/executors.md."
-    )
+    gamma: float = arg(0.0, "Threshold: a failure is f <= gamma; 0 counts collisions.")
+    seed: int = arg(0, "Random seed; the same seed gives the same answer.", count=True)
+    collisions: str = arg("ego", "Collisions that count: ego (the ego's) or any.")
+    device: str = arg("cpu", "Device that simulates: cpu, or a GPU (cuda, cuda:1), which needs core torch or auto.")
     ensemble_run: bool = arg(
-        True,
-        "Where the failures found do not reach the refits of the base, simulate up to as much again under these.",
-        flags="--ensemble-run/--no-ensemble-run",
+        True, "Spend up to the same budget again to cover the uncertainty of the traffic model, if it is needed."
     )
-    trust: bool = arg(False, "Let code run: of the ego's .zip, though others can write to it; of a run from elsewhere.")
-    ego: str = arg("idm", "A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list egos.")
-    algo: str | None = arg(None, "Algorithm of the .zip, if the file does not tell.")
-    stats: str | None = arg(None, "File of the .zip's VecNormalize statistics; by default one is looked for beside it.")
-    ensemble: bool = arg(False, "Take the mixture of the refits of the base: p for the next event.")
-    also_under: str | None = arg(None, "State p under these bases too, by the same simulations: us101-closing,i80.")
+    trust: bool = arg(
+        False, "Allow a policy file that others can write to, or a run made elsewhere, to execute code and to connect."
+    )
+    ego: str = arg(
+        "idm", "Policy under test: a name, a .zip or .onnx file, module:function or tcp://HOST:PORT; list egos has all."
+    )
+    algo: str | None = arg(None, "Algorithm of the policy file, if the file does not tell it.")
+    stats: str | None = arg(
+        None, "File of the policy's VecNormalize statistics; by default it is looked for next to the policy file."
+    )
+    ensemble: bool = arg(False, "Use the mixture of the refits of the traffic model: p for the next event.")
+    also_under: str | None = arg(
+        None, "Estimate p under these traffic models too, from the same simulations: us101-closing,i80."
+    )
     max_sim: int | None = arg(
-        None, "Largest number of simulations.", count=True, show_default="that of the method, 6,000 for two-stage"
+        None,
+        "Largest number of simulations.",
+        count=True,
+        show_default="that of the method, 6,000 for two-stage",
     )
-    target_cov: float | None = arg(None, "Stop at this coefficient of variation.")
-    replicates: int = arg(1, "Independent runs, combined by their mean.")
-    on_error: str = arg("raise", "Where the ego fails twice: raise, failure or bound.")
-    chunk: int | None = arg(None, "Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules.")
-    core: str = arg("auto", "What simulates: torch, numba (compiled, where it can be had: docs/executors.md), or auto.")
-    sensitivity: bool = arg(False, "Show what p is sensitive to: parameters of traffic and of its model.")
-    max_p: float | None = arg(
-        None, "Limit of p: the exit code is 0 if it passes, 4 if it fails, 5 if that is undecided."
+    target_cov: float | None = arg(None, "Relative standard error at which to stop: 0.1 is 10 %.")
+    replicates: int = arg(1, "Number of independent runs, combined by their mean.")
+    on_error: str = arg("raise", "If the ego errors twice on a scenario: raise, or count it as failure or bound.")
+    chunk: int | None = arg(
+        None, "Simulations per batch, few for a slow ego; by default 256 with --workers, 4,096 for egos by rules."
     )
-    max_rate: float | None = arg(None, "Limit of the collisions per million km, in place of --max-p; exit codes alike.")
-    gate_confidence: float = arg(0.95, "One-sided, of the comparison with the limit.", option="confidence")
-    assume_traffic: bool = arg(False, "Compare with the limit as if the traffic model were exact: of the ego alone.")
+    core: str = arg("auto", "Simulator core: torch, numba (compiled) or auto.")
+    sensitivity: bool = arg(False, "Show to which parameters of the traffic and of its model p is sensitive.")
+    max_p: float | None = arg(None, "Limit of p: exit code 0 if p is below it, 4 if above, 5 if undecided.")
+    max_rate: float | None = arg(
+        None, "Limit of the collisions per million km: exit code 0 if the rate is below it, 4 if above, 5 if undecided."
+    )
+    max_ratio: float | None = arg(
+        None, "Limit of p_B / p_A, by how much B may be worse: exit code 0 if it is below, 4 if above, 5 if undecided."
+    )
+    confidence: float = arg(0.95, "Confidence level of the interval; with a limit, that of its one-sided test.")
+    assume_traffic: bool = arg(False, "Test the limit as if the traffic model were exact: a test of the ego alone.")
 
     def __post_init__(self) -> None:
         """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""
@@ -233,25 +249,30 @@ class Question:
     @property
     def has_limit(self) -> bool:
         """Whether the answer is compared with a limit."""
-        return self.max_p is not None or self.max_rate is not None
+        return any(limit is not None for limit in (self.max_p, self.max_rate, self.max_ratio))
 
     @property
     def run_arguments(self) -> RunArguments:
         """The arguments of `samplers.estimate`."""
         from samplers.run import RunArguments
 
-        confidence = RunArguments.confidence
         if self.max_p is not None and self.max_rate is not None:
             raise ValueError("Expected max_p or max_rate, not both: one run has one limit.")
         if self.max_p is not None and not 0.0 < self.max_p < 1.0:
             raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
-        if self.max_rate is not None and not 0.0 < self.max_rate < math.inf:
-            raise ValueError(f"Expected max_rate above 0, got {self.max_rate!r}.")
+        for name in ("max_rate", "max_ratio"):
+            if (limit := getattr(self, name)) is not None and not 0.0 < limit < math.inf:
+                raise ValueError(f"Expected {name} above 0, got {limit!r}.")
+        if self.assume_traffic and not self.has_limit:
+            raise ValueError("Expected assume_traffic together with a limit; see Gate in --help.")
+        confidence = self.confidence
+        if not 0.0 < confidence < 1.0:
+            hint = f": {confidence:g} % is {confidence / 100:g}" if 1.0 < confidence < 100.0 else ""
+            raise ValueError(f"Expected confidence above 0 and below 1, got {confidence!r}{hint}.")
         if self.has_limit:
-            one_sided = self.gate_confidence
-            if not 0.5 < one_sided < 1.0:
-                raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {one_sided!r}.")
-            confidence = round(2.0 * one_sided - 1.0, 12)  # 0.9, where floating point has 0.8999999999999999
+            if not 0.5 < confidence:
+                raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {confidence!r}.")
+            confidence = round(2.0 * confidence - 1.0, 12)  # 0.9, where floating point has 0.8999999999999999
         return RunArguments(
             gamma=self.gamma,
             seed=self.seed,
@@ -287,28 +308,28 @@ def find_method(name: str) -> Stepping:
 class ExecutorOptions:
     """Where simulations are made; none of these options changes the answer."""
 
-    workers: int | None = arg(None, "Processes that simulate; by default this one, or all cores of --executor.")
-    executor: str | None = arg(None, "Where they are: local processes, or the machines of a Ray cluster.")
-    address: str | None = arg(None, "Of the Ray cluster, or auto; by default one is started on this machine.")
-    time_limit: float | None = arg(None, "Seconds for a chunk of simulations, after which its worker counts as hung.")
-    memory_limit: float | None = arg(None, "GiB that the simulations of a worker process may take (Linux).")
+    workers: int | None = arg(None, "Number of processes that simulate; the answer does not depend on it.")
+    executor: str | None = arg(None, "Where the workers are: local (processes) or ray (machines of a Ray cluster).")
+    address: str | None = arg(None, "Address of the Ray cluster, or auto; by default one is started on this machine.")
+    time_limit: float | None = arg(None, "Seconds per batch, after which a worker counts as hung and is restarted.")
+    memory_limit: float | None = arg(None, "Memory limit of each worker in GiB (Linux).")
 
     def make(self) -> Executor | None:
         """Return the executor; None for this process."""
         import samplers
 
-        settings = {"--address": self.address, "--time-limit": self.time_limit, "--memory-limit": self.memory_limit}
+        settings = {"address": self.address, "time_limit": self.time_limit, "memory_limit": self.memory_limit}
         given = [name for name, value in settings.items() if value is not None]
         if self.executor not in (None, *EXECUTORS):
             raise ValueError(f"Expected executor to be {' or '.join(EXECUTORS)}, got {self.executor!r}.")
         if self.executor is None and self.workers is None:
             if given:
-                raise ValueError(f"Expected {given[0]} together with --workers or --executor.")
+                raise ValueError(f"Expected {given[0]} together with workers or executor.")
             return None
         if self.address is not None and self.executor != "ray":
-            raise ValueError("--address does not go with --executor local.")
+            raise ValueError("Expected address together with executor ray.")
         if self.memory_limit is not None and not 0.0 < self.memory_limit < float("inf"):
-            raise ValueError(f"Expected --memory-limit to be a number of GiB above 0, got {self.memory_limit}.")
+            raise ValueError(f"Expected memory_limit to be a number of GiB above 0, got {self.memory_limit}.")
         memory = None if self.memory_limit is None else self.memory_limit * 2.0**30
         if self.executor == "ray":
             return samplers.executors.RayCluster(
@@ -364,25 +385,28 @@ KEYS = {option_name(each): each for kind in (Question, ExecutorOptions) for each
 """Keys, with - or _ between words, and the fields that they stand for."""
 
 
-def read_question_file(path: Path) -> dict[str, Any]:
-    """Return the fields of `Question` and `ExecutorOptions` that a YAML file, which may be JSON, gives."""
+def read_question_file(path: Path, names: Iterable[str] = KEYS, texts: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what a YAML file, which may be JSON, gives: fields of `Question` and `ExecutorOptions`, and texts.
+
+    `names` are the keys of the fields that it may give, and `texts` those of further options.
+    """
     values: dict[str, Any] = {}
+    known = [name for name in (*texts, *names) if name not in NOT_IN_FILES]
     for key, node in _read_nodes(path):
         name = key.replace("-", "_")
         if name in NOT_IN_FILES:
             raise BadInput(f"{str(path)!r} cannot say {key}: give --{key} on the command line.")
-        if name not in KEYS:
-            known = [each for each in KEYS if each not in NOT_IN_FILES]
-            hint = did_you_mean(name, known)
-            raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(known)}.")
+        if name not in known:
+            why = f"the key {key!r}, which this command does not use" if name in KEYS else f"an unknown key {key!r}"
+            raise BadInput(f"{str(path)!r} has {why}{did_you_mean(name, known)}. It may have: {', '.join(known)}.")
         if name in values:
             raise BadInput(f"{str(path)!r} has the key {key!r} more than once.")
-        values[name] = _read_value(node, KEYS[name])
+        values[name] = node.value if name in texts else _read_value(node, KEYS[name])
     try:
-        check_types({name: KEYS[name] for name in values}, values)
+        check_types({name: KEYS[name] for name in values if name not in texts}, values)
     except BadInput as error:
         raise BadInput(f"{str(path)!r}: {error}") from error
-    return {KEYS[name].name: value for name, value in values.items()}
+    return {name if name in texts else KEYS[name].name: value for name, value in values.items()}
 
 
 def read_mapping(path: Path) -> dict[str, Any]:

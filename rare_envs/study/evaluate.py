@@ -13,7 +13,6 @@ import math
 import os
 import pickle
 import reprlib
-import shlex
 import subprocess
 import sys
 import time
@@ -71,7 +70,7 @@ from samplers.workers import ExecutorError
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 8
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
 COMPARISON = "comparison.json"
-UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity")
+UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity", "max_p", "max_rate")
 """Fields of a question that a comparison does not use."""
 
 
@@ -110,23 +109,13 @@ def run(
         >>> report.estimate.p, report.estimate.n_sim
         (0.021, 1000)
     """
-    start, study = time.perf_counter(), settle_chunk(study, executor)
+    start, study = time.perf_counter(), settle_chunk(study, executor is not None)
     advice = "" if journal else " With --out finished simulations would have been kept."
-    question, problem = study.question, study.problem
+    question = study.question
     if question.max_rate is not None:
         with as_bad_input(ValueError):
             find_frequency(study)
-    evaluator = Evaluator(
-        problem if study.ego_was_given else SentProblem(problem, question),
-        question.gamma,
-        cast(OnError, question.on_error),
-        journal=journal,
-        executor=executor,
-        seed=question.seed,
-        size=question.chunk or problem.tile,
-        name="The ego",
-        precision=np.float32,  # in which scenarios are simulated
-    )
+    evaluator = _evaluator_of(study, journal, executor)
     keeper = RowKeeper(study.question.gamma)
 
     def report_on(estimate: samplers.Estimate) -> Report:
@@ -163,9 +152,25 @@ def run(
         return replace(report, repeatability=recheck(study, keeper), lost=table.lost)
 
 
-def settle_chunk(study: Study, executor: Executor | None) -> Study:
-    """Return a study whose question says how many simulations workers make at once, if there are any."""
-    if executor is None or study.question.chunk is not None:
+def _evaluator_of(study: Study, journal: Journal | None, executor: Executor | None) -> Evaluator:
+    """Return what simulates the scenarios of a study."""
+    question, problem = study.question, study.problem
+    return Evaluator(
+        problem if study.ego_was_given else SentProblem(problem, question),
+        question.gamma,
+        cast(OnError, question.on_error),
+        journal=journal,
+        executor=executor,
+        seed=question.seed,
+        size=question.chunk or problem.tile,
+        name="The ego",
+        precision=np.float32,  # in which scenarios are simulated
+    )
+
+
+def settle_chunk(study: Study, chunked: bool) -> Study:
+    """Return a study whose question says how many simulations workers make at once, if it is made in such batches."""
+    if not chunked or study.question.chunk is not None:
         return study
     return replace(study, question=replace(study.question, chunk=study.problem.chunk_size))
 
@@ -314,7 +319,7 @@ def run_into(
     progress: bool = False,
     force: bool = False,
     executor: Executor | None = None,
-    part: bool = False,
+    whole: Mapping[str, Any] | None = None,
 ) -> Report:
     """Answer a question and write the answer; finished simulations are kept if the run is interrupted.
 
@@ -324,8 +329,8 @@ def run_into(
         progress: Show a bar on standard error.
         force: Replace a run that the folder has, finished or not.
         executor: As in `run`.
-        part: It is a part of a larger work, which is begun again as a whole: go on with the simulations of the same
-            question that the folder has, and keep all of them at the end. An ego that is an object starts again.
+        whole: Name and arguments of the command of which it is a part: go on with the simulations of the same question
+            that the folder has, and keep all of them at the end. An ego that is an object starts again.
 
     Returns:
         The report.
@@ -346,16 +351,25 @@ def run_into(
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['answer.png', 'crash.png', 'episodes.parquet', 'failures.csv', 'failures.png', 'result.json', 'study.json']
     """
-    study = settle_chunk(study, executor)
-    part = part and not study.ego_was_given
-    begin = partial(writing.begin_journal, folder, study.question, force, part_of="risk" if part else "")
+    study = settle_chunk(study, executor is not None or bool((whole or {}).get("chunked")))
+    whole = None if study.ego_was_given else whole
+    begin = partial(writing.begin_journal, folder, study.question, force, whole=whole)
     with output_folder(folder, *RESULT_FILES), contextlib.closing(begin()) as journal:
         if journal.has_simulations:
+            study = _in_batches_of(journal, study)
             writing.note_resumption(folder, journal.earlier_seconds)
         else:
             writing.begin_study_file(folder, study)
-        with _keeping(folder, study, journal, part) as target:
-            return _finish(target, run(study, progress, journal, executor, target), journal, keep=part)
+        with _keeping(folder, study, journal, bool(whole)) as target:
+            return _finish(target, run(study, progress, journal, executor, target), journal, keep=bool(whole))
+
+
+def _in_batches_of(journal: Journal | None, study: Study) -> Study:
+    """Return a study in the batches in which its journal was begun."""
+    if journal is None:
+        return study
+    chunk = journal.head["question"]["chunk"]
+    return replace(study, question=replace(study.question, chunk=chunk or study.problem.tile))
 
 
 def resume(
@@ -370,8 +384,7 @@ def resume(
     """Continue an interrupted run; the answer is that of an undisturbed one."""
     journal, question = writing.continue_journal(folder, mend)
     with contextlib.closing(journal), output_folder(folder, *RESULT_FILES):
-        if (part_of := journal.head.get("part_of", "")) not in ("", "risk"):
-            raise BadInput(f"{str(folder)!r} is of rare-envs {part_of}, which goes on with {writing.SAME_AGAIN}")
+        part_of = (journal.head.get("whole") or {}).get("command", "")
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         given = {name: value for name, value in (("ego", ego), ("on_error", on_error)) if value}
@@ -421,8 +434,8 @@ def _keeping(folder: Path, study: Study, journal: Journal, part: bool = False) -
             n_further = n_kept - n if further is None else min(further.n_sim, n_kept - n)
             if n_further > 0:
                 count = f"{n:,} simulations and a further {n_further:,} under the mixture of the refits"
-        again = f"rare-envs resume {shlex.quote(str(folder))}{' --trust' if study.question.trust else ''}"
-        return f" {count} are kept; go on with: {writing.SAME_AGAIN if part else again}"
+        again = writing.advise_resume(folder.parent if part else folder, study.question.trust)
+        return f" {count} are kept; go on with: {again}"
 
     try:
         yield target
@@ -447,31 +460,63 @@ def compare_egos(
     force: bool = False,
     algo_b: str | None = None,
     stats_b: str | None = None,
+    executor: Executor | None = None,
 ) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
     """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end."""
     if out is not None and not force:
         writing.check_no_results(out, COMPARISON)
-    studies = {"A": prepare(question), "B": prepare(replace(question, ego=ego_b, algo=algo_b, stats=stats_b))}
+    questions = {"A": question, "B": replace(question, ego=ego_b, algo=algo_b, stats=stats_b)}
+    return _compare({name: prepare(each) for name, each in questions.items()}, progress, out, force, executor)
+
+
+def resume_comparison(
+    folder: Path, questions: Mapping[str, Question], trust: bool = False, executor: Executor | None = None
+) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
+    """Continue an interrupted comparison of two questions; the answer is that of an undisturbed one."""
+    opened = {
+        name: open_question(asdict(each), folder, trust, core=each.core, device=each.device)
+        for name, each in questions.items()
+    }
+    return _compare({name: prepare(each) for name, each in opened.items()}, True, folder, False, executor)
+
+
+def _compare(
+    studies: dict[str, Study], progress: bool, out: Path | None, force: bool, executor: Executor | None
+) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
+    """Compare the egos A and B of two studies of the same scenarios."""
+    studies = {name: settle_chunk(study, executor is not None) for name, study in studies.items()}
     dims = [study.problem.dim for study in studies.values()]
     if dims[0] != dims[1]:  # of the egos that are shipped, human and noisy:EGO
         raise BadInput(
             f"Expected two egos with the same x, got {dims[0]} and {dims[1]} dimensions, as an ego that is "
             "random has its own in x: estimate each by itself."
         )
-    kept = {name: RowKeeper(question.gamma) for name in studies}
-    asked: dict[str, Any] = {name: getattr(question, name) for name in ("gamma", "seed", "max_sim", "ensemble_run")}
+    question = studies["A"].question
     questions = {name: study.question for name, study in studies.items()}
-    with writing.journals_of("compare", out, questions, force, COMPARISON, FAILURES, BLOCKS) as journals:
-        evaluators = {
-            name: Evaluator(each.problem, question.gamma, journal=journal, name="The ego")
-            for (name, each), journal in zip(studies.items(), journals, strict=True)
-        }
-        for name, evaluator in evaluators.items():
-            evaluator.watchers.append(kept[name].keep)
+    with (
+        writing.journals_of({"command": "compare"}, out, questions, force, COMPARISON, FAILURES, BLOCKS) as journals,
+        contextlib.ExitStack() as stack,
+    ):
+        kept, evaluators = dict[str, RowKeeper](), dict[str, Evaluator]()
+        for (name, study), journal in zip(studies.items(), journals, strict=True):
+            evaluators[name] = _evaluator_of(_in_batches_of(journal, study), journal, executor)
+            kept[name] = RowKeeper(question.gamma)
+            evaluators[name].watchers.append(kept[name].keep)
         try:
-            with as_bad_input(ValueError, EgoGone):
-                method = studies["A"].method
-                found = samplers.compare(evaluators["A"], evaluators["B"], method, progress=progress, **asked)
+            with as_bad_input(ValueError, EgoGone, ExecutorError):
+                for evaluator in evaluators.values():
+                    stack.enter_context(evaluator)
+                asked = question.run_arguments
+                found = samplers.compare(
+                    *evaluators.values(),
+                    studies["A"].method,
+                    asked.gamma,
+                    asked.seed,
+                    asked.max_sim,
+                    asked.confidence,
+                    progress,
+                    ensemble_run=question.ensemble_run,
+                )
         except samplers.EstimationInterrupted as stopped:
             raise RunInterrupted(arguments.describe_stop(stopped.estimate, "P[A or B fails]")) from None
         except KeyboardInterrupt:
@@ -479,18 +524,26 @@ def compare_egos(
         checks = {name: recheck(study, kept[name]) for name, study in studies.items()}
         doubts = [f"{name}: {check.warning}" for name, check in checks.items() if check is not None and check.warning]
         found = replace(found, warnings=(*found.warnings, *doubts))
-        inputs = {key: value for key, value in asdict(question).items() if key not in UNUSED_FIELDS}
-        answer = {
-            **found.to_dict(),
-            "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs, "algo_b": algo_b, "stats_b": stats_b},
-            "notes": [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes],
-            "version": __version__,
-        }
+        answer = _describe_comparison(found, studies)
         if out is not None:
             with writing.unwritten_results(out, (found, answer)):
                 replace_text(out / COMPARISON, format_json(answer) + "\n")
                 writing.write_failures(out, studies["A"].problem.space, found.either.failures)
     return found, answer
+
+
+def _describe_comparison(found: samplers.comparison.Comparison, studies: Mapping[str, Study]) -> dict[str, Any]:
+    """Return a comparison, what was asked and the verdict on its limit, as plain values for JSON."""
+    a, b = (study.question for study in studies.values())
+    inputs = {key: value for key, value in asdict(a).items() if key not in UNUSED_FIELDS}
+    verdict = None if a.max_ratio is None else found.meets(a.max_ratio, a.assume_traffic)
+    return {
+        **found.to_dict(),
+        "question": {"ego_a": inputs.pop("ego"), "ego_b": b.ego, **inputs, "algo_b": b.algo, "stats_b": b.stats},
+        "gate": None if verdict is None else verdict.to_dict(),
+        "notes": [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes],
+        "version": __version__,
+    }
 
 
 def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.analysis.PlannedRun, ...]:

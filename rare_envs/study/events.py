@@ -90,7 +90,7 @@ def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
 
 def describe_traffic(study: Study) -> str:
     """Return the traffic model of a study, and the options that make other traffic of it."""
-    changed = [f"--{name}" for name in ("drivers", "horizon") if getattr(study.question, name) is not None]
+    changed = [name for name in ("drivers", "horizon") if getattr(study.question, name) is not None]
     return f"{study.base_name} with {' and '.join(changed)}" if changed else study.base_name
 
 

@@ -164,7 +164,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
         if question.also_under is not None and (not names or len(set(names)) < len(names)):
             raise ValueError(
-                f"Expected --also-under with one base or more, each once, such as i80; got {question.also_under!r}."
+                f"Expected also_under with one base or more, each once, such as i80; got {question.also_under!r}."
             )
         others = {name: study.under(name).problem.base for name in names}
     problem.varies = problem.varies or _answers_vary(problem, question.on_error)
@@ -216,7 +216,7 @@ def _answers_vary(problem: DrivingProblem, on_error: str) -> bool:
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         words = ("" if isinstance(error, SystemExit) else str(error)) or repr(error)
         if on_error != "raise":
-            words = f"{words.rstrip('.')}. --on-error {on_error} counts scenarios of a run; this check comes before it"
+            words = f"{words.rstrip('.')}. on_error: {on_error} counts scenarios of a run; this check comes before it"
         raise BadInput(f"The ego fails on its first observation of {problem.env_id}: {words}") from error
     same = torch.equal(first.state.speed, again.state.speed) and torch.equal(first.state.heading, again.state.heading)
     return not same

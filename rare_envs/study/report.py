@@ -45,7 +45,9 @@ COLLISION_MEASURE = "ttc"
 """The measure to advise: -1 after a collision and above 0 without one."""
 MODEL_NOUN = "traffic model"
 """What a traffic model of scenarios is called."""
-ENSEMBLE_REASON = "the parameters of an ensemble are those of all its refits; without --ensemble there are derivatives"
+ENSEMBLE_REASON = (
+    "the parameters of an ensemble are those of all its refits; without ensemble: true there are derivatives"
+)
 """Why there are no derivatives of the mean over refits."""
 
 
@@ -75,7 +77,7 @@ def explain_other_events(question: Question) -> str:
     if not (measure.collision if isinstance(measure.collision, float) else 0.0) <= question.gamma <= 0:
         return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
     if question.collisions != "ego":
-        return f"--collisions {question.collisions} counts those between other vehicles too"
+        return f"collisions: {question.collisions} counts those between other vehicles too"
     return ""
 
 
@@ -250,7 +252,7 @@ class Report:
         drivers_vary = world.background is not None and world.background.noisy
         if noise is not True and not world.sensing.weather and not drivers_vary:
             word = "off" if noise is False else noise
-            found.insert(0, f"--noise {word} changes nothing: no driver here has noise (see --drivers)")
+            found.insert(0, f"noise: {word} changes nothing: no driver here has noise (see --drivers)")
         found += [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
         found += [f"what {name} would do is not known: {why}" for name, why in self.kinds.others_unknown.items()]
         found += [f"sensitivity is not known: {self.sensitivity}"] if isinstance(self.sensitivity, str) else []

@@ -6,7 +6,7 @@ import contextlib
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -29,10 +29,11 @@ from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, ke
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
-from rare_envs.study.question import Study, build_problem, prepare
+from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
+from samplers.evaluate import Executor
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
 from samplers.result import list_warnings
 
@@ -75,7 +76,9 @@ def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str
     return site
 
 
-def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:
+def compare_sites(
+    report: Report, sites: Sequence[str], progress: bool = False, executor: Executor | None = None
+) -> dict[str, float]:
     """Return rates per km at other sites over that of a report, by name."""
     study, factors = report.study, dict[str, float]()
     if report.estimate.p == 0 or report.rate is None:
@@ -89,7 +92,7 @@ def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) 
         try:
             p = report.estimate.reweight(other.problem.base).p
         except ValueError:
-            p = run(other, progress).estimate.p if name in sites else math.nan
+            p = run(other, progress, executor=executor).estimate.p if name in sites else math.nan
         if p > 0:
             factors[name] = p * base.frequency.per_km / report.rate.per_million_km * exposure.MILLION_KM
     return factors
@@ -276,6 +279,7 @@ def risk(
     out: str | PathLike[str] | None = None,
     progress: bool = False,
     force: bool = False,
+    executor: Executor | None = None,
     **options: Any,
 ) -> Risk:
     """Estimate the collisions of an ego per million km, with an interval that includes what is not known of traffic.
@@ -292,10 +296,11 @@ def risk(
             first are used, and the spread of the rate between it and the others is part of the interval. Each
             scenario must have a base of the first site, or one in `bases`.
         bases: Traffic models, names or JSON files, by scenario, in place of those of the first site.
-        out: Folder for the picture, the numbers and a folder of each scenario. After an interruption the same call
-            goes on with the simulations that it has, unless the ego is an object.
+        out: Folder for the picture, the numbers and a folder of each scenario. After an interruption the same call,
+            or `resume_risk`, continues with the simulations that it has, unless the ego is an object.
         progress: Show a bar on standard error.
         force: Replace runs that the folder has, finished or not.
+        executor: Where simulations are made, as in `rare_envs.study.run`.
         **options: Further fields of `rare_envs.study.Question`: seed, max_sim (of each scenario), method, max_rate (a
             limit of the sum, see `Risk.verdict`) and so on.
 
@@ -311,12 +316,43 @@ def risk(
         >>> found.total.per_million_km, round(found.total.interval_per_million_km[1], -3)
         (0.0, 23000.0)
     """
-    sites = (sites,) if isinstance(sites, str) else sites
-    scenarios = (scenarios,) if isinstance(scenarios, str) else scenarios
-    folder, named = None if out is None else Path(out), isinstance(ego, str)
+    sites = [sites] if isinstance(sites, str) else [*sites]
+    scenarios = [scenarios] if isinstance(scenarios, str) else [*scenarios]
+    whole = {"command": "risk", "ego": ego if isinstance(ego, str) else "", "scenarios": scenarios, "sites": sites}
+    whole |= {"bases": {name: str(base) for name, base in (bases or {}).items()}, "chunked": executor is not None}
+    whole |= {"options": {name: value for name, value in options.items() if name not in CHANGEABLE}}
+    return _risk(ego, whole, bases or {}, None if out is None else Path(out), progress, force, executor, options)
+
+
+def resume_risk(folder: Path, questions: Mapping[str, Question], whole: Mapping[str, Any], **how: Any) -> Risk:
+    """Continue an interrupted risk from its arguments, `whole`, and the questions that it has begun.
+
+    The answer is that of an undisturbed one; `how` has trust and an executor.
+    """
+    trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
+    for question in questions.values():
+        open_question(asdict(question), folder, trust)
+    options = {**whole["options"], "trust": trust, "core": first.core, "device": first.device}
+    with as_bad_input(KeyError, TypeError, AttributeError):
+        return _risk(whole["ego"], dict(whole), whole["bases"], folder, True, False, executor, options)
+
+
+def _risk(
+    ego: Any,
+    whole: dict[str, Any],
+    bases: Mapping[str, str | PathLike[str]],
+    folder: Path | None,
+    progress: bool,
+    force: bool,
+    executor: Executor | None,
+    options: Mapping[str, Any],
+) -> Risk:
+    """Estimate a risk from its checked arguments, `whole`, which its parts record."""
+    scenarios, sites = whole["scenarios"], whole["sites"]
+    named = isinstance(ego, str)
     ego_name = ego if named else type(ego).__name__
     with as_bad_input(ValueError):
-        chosen = _choose_scenarios(scenarios, sites, bases or {})
+        chosen = _choose_scenarios(scenarios, sites, bases)
     with as_bad_input(TypeError, ValueError):
         if options.get("max_p") is not None:
             raise ValueError("Expected max_rate, a limit of the sum, not max_p.")
@@ -342,7 +378,7 @@ def risk(
         done: list[ScenarioRisk] = []
         for study in studies:
             try:
-                done.append(_evaluate(study, sites[1:], folder, progress))
+                done.append(_evaluate(study, sites[1:], folder, progress, executor, whole))
             except RunInterrupted as error:
                 known = "; ".join(
                     f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done
@@ -412,13 +448,23 @@ def _find_misfits(questions: Mapping[str, Question], ego: Any) -> dict[str, str]
     return found
 
 
-def _evaluate(study: Study, other_sites: Sequence[str], folder: Path | None, progress: bool) -> ScenarioRisk:
+def _evaluate(
+    study: Study,
+    other_sites: Sequence[str],
+    folder: Path | None,
+    progress: bool,
+    executor: Executor | None,
+    whole: Mapping[str, Any],
+) -> ScenarioRisk:
     """Run one scenario and return its rate, with the spread between sites if there are others."""
     name = study.problem.world.scenario.name
-    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, part=True)
+    if folder is None:
+        report = run(study, progress, executor=executor)
+    else:
+        report = run_into(folder / name, study, progress, executor=executor, whole=whole)
     assert report.rate is not None  # `risk` has looked for the frequency before
     with keep_answer(report):
-        factors = compare_sites(report, other_sites, progress)
+        factors = compare_sites(report, other_sites, progress, executor)
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
     rate = replace(report.rate, site_log_sd=float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0)
     return ScenarioRisk(report=report, rate=rate, site_factors=factors)

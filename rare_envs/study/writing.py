@@ -29,47 +29,93 @@ from rare_envs.study import run_folder
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, output_folder, read_question
 from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import SEVERE, save_pictures, saved_figure
-from rare_envs.study.question import Study, digest_files, find_ego_files, is_same_question, note_question, read_about
+from rare_envs.study.question import (
+    CHANGEABLE,
+    Study,
+    digest_files,
+    find_ego_files,
+    is_same_question,
+    note_question,
+    read_about,
+)
 from rare_envs.study.report import Report
 from rare_envs.study.text import report_as_json
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
 
+WHOLES = ("risk.json", "comparison.json", "estimate.safetensors")
+"""Results of commands that are no single estimate."""
 BEGIN_AGAIN = "give the command again."
 """Advice if there is nothing to continue."""
-SAME_AGAIN = "the same command again, without --force."
-"""How goes on what is no single estimate."""
 
 
-def begin_journal(folder: Path, question: Question, force: bool = False, part_of: str = "") -> Journal:
-    """Return the journal of a new run; `force` replaces that of an unfinished one, a part of a command continues it."""
+def advise_resume(folder: Path, trust: bool = False) -> str:
+    """Return the command that continues the run in a folder."""
+    return f"rare-envs resume {shlex.quote(str(folder))}{' --trust' if trust else ''}"
+
+
+def begin_journal(
+    folder: Path, question: Question, force: bool = False, whole: Mapping[str, Any] | None = None
+) -> Journal:
+    """Return the journal of a new run; `force` replaces that of an unfinished one.
+
+    A part of a command, whose name and arguments are `whole`, is continued.
+    """
     if not force and not (folder / run_folder.JOURNAL).exists():
         check_no_results(folder)
     head: dict[str, Any] = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
-    head |= {"seed": question.seed, "part_of": part_of}
+    head |= {"seed": question.seed, "whole": dict(whole or {})}
     try:
         return Journal.create(folder / run_folder.JOURNAL, head, replace=force)
     except JournalError as error:
         if "already" not in str(error):
             raise BadInput(error) from error
-        if part_of:
+        if whole:
             return _continue_same(folder, head)
         raise BadInput(
-            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume "
-            f"{shlex.quote(str(folder))}, or replace it by --force."
+            f"There is an unfinished run in {str(folder)!r}: continue it with {advise_resume(folder)}, or replace it "
+            "by --force."
         ) from error
     except OSError as error:
         raise BadInput(f"Cannot write to the folder {str(folder)!r}: {error.strerror}.") from error
 
 
-def _continue_same(folder: Path, head: Mapping[str, Any]) -> Journal:
-    """Return the journal of an unfinished run of the question and files of a head."""
+def _continue_same(folder: Path, head: dict[str, Any]) -> Journal:
+    """Return the journal of an unfinished run of the question and files of a head, in the batches of its beginning."""
     journal, _ = continue_journal(folder)
-    if journal.head == json.loads(json.dumps(head)):
+    if _of_any_chunk(journal.head) == _of_any_chunk(json.loads(json.dumps(head))):
         return journal
     journal.close()
     raise BadInput(f"The run in {str(folder)!r} is of another question, or of other files: replace it by --force.")
+
+
+def _of_any_chunk(head: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a head without what a run that is continued may change, the size of batches included."""
+    question = {name: value for name, value in head["question"].items() if name not in ("chunk", *CHANGEABLE)}
+    return {**head, "question": question, "whole": dict(head.get("whole") or {}) | {"chunked": None}}
+
+
+def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], dict[str, Question]]:
+    """Return the folder of an unfinished run, its command with arguments, and the questions of the parts begun.
+
+    The command is empty for a single estimate; a folder of a part of a comparison means that of the comparison.
+    """
+    parts = [""] if (folder / run_folder.JOURNAL).exists() else []
+    parts += [path.parent.name for path in sorted(folder.glob(f"*/{run_folder.JOURNAL}"))]
+    whole, questions = dict[str, Any](), dict[str, Question]()
+    for part in parts or [""]:
+        journal, questions[part] = continue_journal(folder / part, mend)
+        found = dict(journal.head.get("whole") or {})
+        journal.close()
+        if part == "" and found.get("command") == "compare":
+            return find_whole(folder.parent, mend)
+        if part == "":
+            return folder, found if found.get("command") == "estimate" else {}, questions
+        if not found or whole not in ({}, found):
+            raise BadInput(f"{str(folder)!r} has several runs: continue each, such as {advise_resume(folder / part)}.")
+        whole = found
+    return folder, whole, questions
 
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
@@ -81,8 +127,8 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
         why = f"it has no {run_folder.JOURNAL}. If the run was {begun}, {BEGIN_AGAIN}"
         if (folder / run_folder.RESULT).is_file():
             why = f"it has a finished one ({run_folder.RESULT})."
-        elif next(folder.glob(f"*/{run_folder.JOURNAL}"), None):
-            why = f"its parts go on with {SAME_AGAIN}"
+        elif done := next((name for name in WHOLES if (folder / name).is_file()), ""):
+            why = f"it has a finished one ({done})."
         elif not folder.is_dir():
             why = f"the folder does not exist. If the run was {begun}, {BEGIN_AGAIN}"
         raise BadInput(f"There is no unfinished run in {str(folder)!r}: {why}") from error
@@ -95,8 +141,7 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
         if "damaged from its first record on" in str(error):
             advice = " Nothing can be taken from it: it is left as it is, and the command with --force replaces it."
         elif "damaged" in str(error):
-            again = f"rare-envs resume {shlex.quote(str(folder))} --mend"
-            advice = f" To keep what is before the damage: {again}."
+            advice = f" To keep what is before the damage: {advise_resume(folder)} --mend."
         raise BadInput(f"{error}{advice}") from error
     version = journal.head.get("version")
     try:
@@ -110,11 +155,12 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
 
 @contextlib.contextmanager
 def journals_of(
-    command: str, out: Path | None, questions: Mapping[str, Question], force: bool, *results: str
+    whole: Mapping[str, Any], out: Path | None, questions: Mapping[str, Question], force: bool, *results: str
 ) -> Iterator[Sequence[Journal | None]]:
     """Yield the journals of the parts of a command, each in a folder in `out`; what stops it says what they keep.
 
-    If it begins by `force`, the parts and the results of an earlier one are removed. None without `out`.
+    `whole` has the name of the command and its arguments. If it begins by `force`, the parts and the results of an
+    earlier one are removed. None without `out`.
     """
     with contextlib.ExitStack() as stack:
         if out is None:
@@ -127,8 +173,8 @@ def journals_of(
             for name in results:
                 (out / name).unlink(missing_ok=True)
         for folder, question in parts.items():
-            journal = begin_journal(folder, question, part_of=command)
-            journals.append(stack.enter_context(contextlib.closing(journal)))
+            journals.append(stack.enter_context(contextlib.closing(begin_journal(folder, question, whole=whole))))
+            note_question(question)
         try:
             yield journals
         except (BadInput, KeyboardInterrupt) as error:
@@ -136,7 +182,8 @@ def journals_of(
                 for journal in journals:
                     journal.remove()
                 raise
-            again = f"{error} {kept:,} simulations are kept; go on with: {SAME_AGAIN}"
+            trust = any(question.trust for question in questions.values())
+            again = f"{error} {kept:,} simulations are kept; go on with: {advise_resume(out, trust)}"
             kind = RunInterrupted if isinstance(error, KeyboardInterrupt) else UnwrittenResults
             raise kind(again, getattr(error, "report", None)) from error
         for folder, journal in zip(parts, journals, strict=True):

@@ -9,6 +9,10 @@ checkpoint. The same command on the same folder takes up a training that was sto
 
 from __future__ import annotations
 
+import contextlib
+import json
+import shlex
+import sys
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -32,8 +36,8 @@ class SourceOptions(RecordingOptions):
     """Options that name the source of recorded scenes."""
 
     location: LocationOption = None
-    recording: Annotated[list[str] | None, typer.Option(help="Of highD, such as 01; may be repeated.")] = None
-    seconds: Annotated[float, typer.Option(help="Length of the scenes of such files [s].")] = Source.seconds
+    recording: Annotated[list[str] | None, typer.Option(help="Recording of highD, such as 01; may be repeated.")] = None
+    seconds: Annotated[float, typer.Option(help="Length of the scenes of such files in seconds.")] = Source.seconds
 
 
 @spread_options
@@ -42,15 +46,23 @@ def main(
     out: RunFolderOption,
     recordings: SourceOptions,
     config: Config,
-    device: Annotated[str, typer.Option(help="Where to train: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device that trains: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
     log: Annotated[bool, typer.Option("--log", help="Write TensorBoard logs into the folder.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
-    """Train a driver from recorded traffic. training/imitation/config.py says what the settings mean."""
-    with report_errors("train"):
+    """Train a driver model of surrounding vehicles from recorded traffic, for estimate --drivers.
+
+    Example: python -m training.imitation --highd path/to/highD/data --method gail --out runs/drivers
+    """
+    with report_errors("training.imitation"):
         kind, path = recordings.kind_and_path()
         source = Source(kind, path, recordings.location, tuple(recordings.recording or ()), recordings.seconds)
-        driver = train_driver(source, config, out, log=log, progress=True, device=device)
-    print(f"Saved {driver}. Next: agents.load_driver({str(driver)!r})")
+        with contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout):
+            driver = train_driver(source, config, out, log=log, progress=True, device=device)
+    if as_json:
+        print(json.dumps({"driver": str(driver), "method": config.method, "seed": config.seed}, indent=2))
+    else:
+        print(f"Saved {driver}. Next: rare-envs estimate SCENARIO --drivers {shlex.quote(str(driver))}")
 
 
 if __name__ == "__main__":

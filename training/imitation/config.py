@@ -44,7 +44,9 @@ class Config:
     """
 
     method: Literal["gail", "mgail"] = "mgail"
+    """Algorithm: mgail (through a model of the traffic) or gail (by policy gradients)."""
     seed: int = 0
+    """Random seed; the same seed gives the same weights."""
     updates: int = 1500
     """Number of updates of the policy after behaviour cloning."""
     noise: Literal["human", "white"] = "human"
@@ -52,9 +54,13 @@ class Config:
 
     # behaviour cloning, from which both methods start
     epochs: int = 6
+    """Epochs of behaviour cloning."""
     batch: int = 512
+    """Batch size of behaviour cloning."""
     clone_rate: float = 1e-3
+    """Learning rate of behaviour cloning."""
     weight_decay: float = 1e-4
+    """Weight decay of behaviour cloning."""
     log_std_cap: float = 0.0
     """Upper bound of the logarithm of the standard deviation, see `agents.learned.networks.Policy`."""
 
@@ -73,13 +79,17 @@ class Config:
 
     # costs of the policy
     critic_weight: float = 3.0
+    """Weight of the critic in the cost."""
     clone_weight: tuple[float, float] = (0.1, 0.06)
     """Weight of the likelihood of recorded actions, a geometric schedule."""
     anneal: float = 0.7
     """Share of the training in which the schedules run."""
     collision_weight: float = 16.0
+    """Weight of collisions in the cost."""
     edge_weight: float = 16.0
+    """Weight of leaving the road in the cost."""
     brake_weight: float = 1.0
+    """Weight of hard braking in the cost."""
     headway_weight: float = 0.0
     """Weight of following closely, which people do: 0 for drivers of the traffic, as the next two."""
     lane_weight: float = 0.0
@@ -89,27 +99,38 @@ class Config:
 
     # optimisation
     policy_rate: float = 3e-4
+    """Learning rate of the policy."""
     critic_rate: float = 4e-4
+    """Learning rate of the critic."""
     last_rate: float = 0.1
     """Share of the learning rates of policy and critic that is left at the end. They fall once the schedules have
     ended, so that the policy settles: only that of the last update is kept."""
     critic_steps: int = 3
+    """Updates of the critic in each update of the policy."""
     critic_batch: int = 512
+    """Batch size of the critic."""
     memory: int = 8
     """Number of rollouts that the critic learns from."""
     warm_up: int = 30
     """Number of rounds in which only the critic learns."""
     gradient_penalty: float = 0.5
+    """Weight of the gradient penalty of the critic."""
     credit: float = 0.97
     """Of MGAIL: share of the gradient of the state that is passed on to the tick before."""
 
     # GAIL, by proximal policy optimisation
     discount: float = 0.97
+    """Discount factor of rewards."""
     gae: float = 0.95
+    """Factor lambda of generalised advantage estimation."""
     clip: float = 0.2
+    """Clipping range of the probability ratio."""
     ppo_epochs: int = 4
+    """Epochs of each update."""
     ppo_batch: int = 2048
+    """Batch size of each update."""
     value_rate: float = 1e-3
+    """Learning rate of the value function."""
 
     def __post_init__(self) -> None:
         if self.method not in ("gail", "mgail"):

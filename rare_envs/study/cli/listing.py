@@ -1,4 +1,4 @@
-"""Listing: the names that the command line takes, what each means, and the base distributions of a scenario."""
+"""Listing: the names that the command line takes, what each means, and the traffic models of a scenario."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from rare_envs.scenarios.registry import (
     HIGHWAY_ENV_IDS,
     SCENARIOS,
     complete_id,
-    env_id_of,
     find_scenario,
     kinematics_id,
     split_layout,
@@ -35,6 +34,7 @@ from rare_envs.sensors.camera import CONDITIONS, SENSOR_NOISE
 from rare_envs.simulation.background import noise_size
 from rare_envs.study.arguments import BadInput
 from rare_envs.study.text import CleanConsole, format_rate
+from samplers.output import MOST_LINES, fold_rows
 
 TICK = 0.1
 """[s], the usual one."""
@@ -51,9 +51,9 @@ EGOS = {
     "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
     "FILE.zip": "policy saved by Stable-Baselines3 or sb3-contrib, VecNormalize statistics beside it included",
     "hf:USER/REPOSITORY": "such a policy of the Hugging Face Hub, from its cache on this machine or downloaded",
-    "FILE.onnx": "graph from observations to actions; rare-envs export-ego writes one of a .zip",
+    "FILE.onnx": "graph from observations to actions; rare-envs export EGO.zip EGO.onnx writes one",
     "module:function": "what your function returns: any object with Stable-Baselines3's predict",
-    "tcp://HOST:PORT": "program in any language, see docs/egos.md; rare-envs serve-ego serves one of these",
+    "tcp://HOST:PORT": "program in any language, see docs/egos.md; python -m agents.remote serves one of these",
     "process:EGO": "one of these in a process of its own, for an ego that may hang or die",
     "noisy:EGO": "one of these behind the imperfections of a full stack, see docs/egos.md",
 }
@@ -63,7 +63,7 @@ DRIVERS = {
     "gail": "a network learned by policy gradients, without rules",
     "idm": "rule-based driver, Intelligent Driver Model and lane keeping by what it sees",
     "idm+mobil": "the same, which changes lanes too, by MOBIL",
-    "FILE.safetensors": "driver that you trained, see rare-envs train-drivers",
+    "FILE.safetensors": "driver that you trained by python -m training.imitation",
 }
 TITLES = {
     "methods": "Methods",
@@ -73,23 +73,13 @@ TITLES = {
 }
 """Kinds of names that have one line each, and the titles of their tables."""
 EVERYTHING = "all"
-KINDS = ("environments", *TITLES, "weather", EVERYTHING)
+KINDS = ("environments", "bases", *TITLES, "weather", EVERYTHING)
 """What can be shown in detail, beside one environment."""
 
 
 def list_names() -> dict[str, Any]:
     """Return everything that can be named on the command line, as JSON-ready values."""
-    environments = {}
-    for env_id, scenario in SCENARIOS.items():
-        n_noise = noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)
-        environments[env_id] = {
-            "kinematics_id": kinematics_id(env_id),
-            "parameters": [_describe(parameter) for parameter in scenario.parameters],
-            "vehicles": list(scenario.vehicle_names),
-            "bases": list(scenario.bases),
-            "drivers": scenario.drivers,
-            "of_learned_drivers": [{"name": "weights", "size": HEAD_SIZE}, {"name": "noise", "size": n_noise}],
-        }
+    environments = {env_id: _describe_environment(env_id, scenario) for env_id, scenario in SCENARIOS.items()}
     measures = {name: each.of if isinstance(each, Measure | TraceMeasure) else each for name, each in MEASURES.items()}
     return {
         "environments": environments,
@@ -99,6 +89,19 @@ def list_names() -> dict[str, Any]:
         "egos": EGOS,
         "drivers": DRIVERS,
         "measures": {name: _first_line(measure) for name, measure in measures.items()},
+    }
+
+
+def _describe_environment(env_id: str, scenario: Scenario) -> dict[str, Any]:
+    """Return what a scenario has, JSON-ready."""
+    n_noise = noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)
+    return {
+        "kinematics_id": kinematics_id(env_id),
+        "parameters": [_describe(parameter) for parameter in scenario.parameters],
+        "vehicles": list(scenario.vehicle_names),
+        "bases": list(scenario.bases),
+        "drivers": scenario.drivers,
+        "of_learned_drivers": [{"name": "weights", "size": HEAD_SIZE}, {"name": "noise", "size": n_noise}],
     }
 
 
@@ -130,23 +133,28 @@ def print_overview(entries: dict[str, Any]) -> None:
             table.add_row(Text(name, style=style), Text(text, style=style if rows is environments else ""))
         console.print(table)
     console.print(
-        "What they mean: rare-envs list egos (or another kind, an environment, all).\n"
-        "Base distributions: rare-envs bases cut_in."
+        "What they mean: rare-envs list egos (or another kind, or all).\n"
+        "A scenario with its traffic models: rare-envs list CutIn. All traffic models: rare-envs list bases."
     )
 
 
 def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
-    """Return the part of the names that a kind, an environment id or its part behind the slash means."""
-    env_id = complete_id(what)
-    if what not in KINDS and env_id not in entries["environments"]:
-        names = [part for name in entries["environments"] for part in (name, name.partition("/")[2])]
-        hint = did_you_mean(what, [*KINDS, *names])
-        raise BadInput(f"Expected {', '.join(KINDS)} or an environment, got {what!r}{hint}.")
+    """Return the part of the names that a kind or a scenario means, a scenario and "bases" with traffic models."""
     if what == EVERYTHING:
         return entries
-    if what not in KINDS:
-        return {"environments": {env_id: entries["environments"][env_id]}}
-    return {kind: entries[kind] for kind in (("environments", "highway_env") if what == "environments" else (what,))}
+    if what == "bases":
+        return {"bases": {env_id: list_bases(env_id) for env_id in entries["environments"]}}
+    if what in KINDS:
+        return {
+            kind: entries[kind] for kind in (("environments", "highway_env") if what == "environments" else (what,))
+        }
+    env_id = split_layout(complete_id(what))[0]
+    if env_id not in entries["environments"] and ":" not in env_id:
+        hint = did_you_mean(what, [*KINDS, *entries["environments"], *(each.name for each in SCENARIOS.values())])
+        raise BadInput(f"Expected {', '.join(KINDS)} or a scenario, such as CutIn, got {what!r}{hint}.")
+    scenario = find_scenario(env_id)
+    own = env_id.rpartition(":")[2]
+    return {"environments": {own: _describe_environment(own, scenario)}, "bases": {own: list_bases(env_id)}}
 
 
 def print_details(chosen: dict[str, Any]) -> None:
@@ -157,17 +165,23 @@ def print_details(chosen: dict[str, Any]) -> None:
         added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
         for text in (
             f"vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}",
-            f"base distributions: {', '.join(environment['bases'])}, or your own JSON file",
-            f"drivers around the ego: {environment['drivers'] or 'a script, unless told otherwise'}",
+            f"traffic models (--base): {', '.join(environment['bases'])}, or your own JSON file",
+            f"drivers around the ego (--drivers): {environment['drivers'] or 'a script by default'}",
             f"learned drivers add{', those above too' if environment['drivers'] else ''}: {added}",
             f"with HighwayEnv's observations and actions: {environment['kinematics_id']}\n",
         ):
             console.print(f"  {text}")
+    for env_id, bases in chosen.get("bases", {}).items():
+        print_bases(env_id, bases)
     if "highway_env" in chosen:
         own = "HighwayEnv's own, for estimate, and with its settings for rare_envs.highway_env_problem in Python: "
         console.print(f"{own}{', '.join(chosen['highway_env'])}\n")
     if "weather" in chosen:
-        _print_parameters(console, "Weather, which --weather adds for egos with a camera", chosen["weather"])
+        _print_parameters(
+            console,
+            "Weather for egos with a camera (weather: true in a file for --config)",
+            chosen["weather"],
+        )
     for kind in (kind for kind in TITLES if kind in chosen):
         _print_table(console, TITLES[kind], ["name", "what it is"], chosen[kind].items())
 
@@ -189,22 +203,21 @@ def _print_table(console: Console, title: str, heads: list[str], rows: Iterable[
     console.print(table)
 
 
-def list_bases(scenario: str) -> tuple[str, dict[str, dict[str, Any]]]:
-    """Return the environment id that an id or a short name means, and its base distributions, the default first."""
-    env_id = split_layout(env_id_of(scenario))[0]
-    found = find_scenario(env_id)
-    return env_id, {name: _describe_base(found, name) for name in found.bases}
+def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
+    """Return the traffic models of a scenario by name, the default first."""
+    found = find_scenario(scenario)
+    return {name: _describe_base(found, name) for name in found.bases}
 
 
 def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print what `list_bases` returns for an environment, a few lines each."""
+    """Print what `list_bases` returns for a scenario, a few facts each, in lines of less than a hundred columns."""
     console = CleanConsole(highlight=False, soft_wrap=True, markup=False)
-    console.print(f"base distributions of {env_id}")
+    console.print(f"Traffic models of {env_id}", style="bold")
     for number, (name, base) in enumerate(bases.items()):
-        console.print(f"{name}{'   (the default)' if number == 0 else ''}", style="bold")
-        for title, text in _summarise(base).items():
-            if text:
-                console.print(f"  {title:<22} {text}")
+        console.print(f"{name}{' (default)' if number == 0 else ''}", style="bold")
+        facts = [(f"  {title}", text) for title, text in _summarise(base).items() if text]
+        console.print("\n".join(fold_rows(facts, len(facts) * MOST_LINES)))
+    console.print()
 
 
 def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
@@ -245,6 +258,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
     family, coordinates = base["family"] or "", base["coordinates"] or ""
     told = all(part.rpartition(": ")[2] in family for part in coordinates.split("; "))  # of strata each by itself
     checks = describe_checks(base["checks"])
+    against = f" ({base['checked_against']})" if base["checked_against"] else ""
     counted, known = f"not known, no rate per hour or km: {base['no_frequency']}", base["frequency"]
     if known is not None:
         counted = f"{format_rate(known['per_hour'])} per hour, {format_rate(known['per_km'])} per km: "
@@ -259,6 +273,6 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "fit": ", ".join(text.format(value) for text, value in fit.items() if value is not None),
         "frequency": counted,
         "counted in": (known or {}).get("source", ""),
-        "recorded / expected": checks + (f" ({base['checked_against']})" if base["checked_against"] else ""),
+        "checks": f"recorded / expected: {checks}{against}" if checks else "",
         **{who: describe_motion(found) for who, found in base["motion"].items()},
     }

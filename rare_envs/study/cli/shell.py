@@ -13,24 +13,26 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_type_hints
 
 import typer
 from typer import Argument, Option
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from rare_envs.plugins import EgoGone, clean_text
 from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
 from rare_envs.study.arguments import (
     GATE_CODES,
+    KEYS,
     BadInput,
     ExecutorOptions,
     Question,
     UnwrittenResults,
     option_name,
+    read_question_file,
     read_whole,
 )
 
@@ -52,6 +54,38 @@ _PLAIN_WORDS = (
     (r"Input should be a valid integer, unable to parse string as an \w+", "expected a whole number"),
 )
 """What Typer says of a wrong value in words of the library that it checks values with, and what is said instead."""
+
+
+PANELS = {
+    "Ego and scenario": "ego base scenario sites drivers observation action",
+    "Question": "measure gamma",
+    "Precision and budget": "method max_sim target_cov confidence plan",
+    "Gate": "max_p max_rate max_ratio assume_traffic",
+    "Run": "seed workers executor address time_limit memory_limit on_error mend config trust",
+    "Output": "out force details as_json help",
+}
+"""Titles of the sections of a help page and their options, most used first; others are in a section before these."""
+FEW = 12
+"""Options of a command that need no sections."""
+
+
+class PanelCommand(TyperCommand):
+    """A command whose options are in the sections `PANELS` on its help page, if they are many."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, and the options in their sections."""
+        options = {each.name: each for each in self.get_params(ctx) if each.param_type_name == "option"}
+        panels = {title: names.split() for title, names in PANELS.items()}
+        listed = [name for names in panels.values() for name in names]
+        panels = {"Options": [name for name in options if name not in listed], **panels}
+        if len(options) <= FEW:
+            panels = {"Options": [name for names in panels.values() for name in names]}
+        sections = {"Arguments": [each for each in self.get_params(ctx) if each.name not in options]}
+        sections |= {title: [options[name] for name in names if name in options] for title, names in panels.items()}
+        for title, parameters in sections.items():
+            if rows := [row for each in parameters if (row := each.get_help_record(ctx))]:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
 
 class SummarisedCommands(TyperGroup):
@@ -91,6 +125,8 @@ class OneLineErrors(SummarisedCommands):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
         except _UsageError as error:
+            if advice := advise_elsewhere(error, words):
+                _fail(advice)
             said = getattr(error, "format_message")()  # noqa: B009  (differs by version)
             for pattern, plain in _PLAIN_WORDS:
                 said = re.sub(pattern, plain, said)
@@ -125,6 +161,45 @@ class OneLineErrors(SummarisedCommands):
                 break
             path.append(word)
         return " ".join(path)
+
+
+ELSEWHERE = {
+    "plan": "rare-envs estimate SCENARIO --plan",
+    "bases": "rare-envs list SCENARIO, or rare-envs list bases",
+    "export-ego": "rare-envs export EGO.zip EGO.onnx",
+    "train-drivers": "python -m training.imitation",
+    "serve-ego": "python -m agents.remote",
+    "bench": "python -m benchmarks.samplers",
+}
+"""Words that are no command, and the command that does what they say."""
+
+
+def advise_elsewhere(error: Exception, words: Sequence[str]) -> str:
+    """Return where an option or a command is that a line of words has in vain; empty if there is no such place."""
+    option, context = getattr(error, "option_name", None), getattr(error, "ctx", None)
+    if option is None:
+        typed = re.match("No such command '(.*?)'", getattr(error, "message", ""))
+        better = ELSEWHERE.get(typed[1]) if typed else None
+        return f"No such command {typed[1]!r}: it is {better}." if typed and better else ""
+    key, keys = (
+        option.lstrip("-").replace("-", "_"),
+        _file_keys(context),
+    )
+    is_off = key.startswith("no_") and key[3:] in keys
+    key = key[3:] if is_off else key
+    if key not in keys:
+        return ""
+    at = next((number for number, word in enumerate(words) if word.partition("=")[0] == option), 0)
+    value = words[at].partition("=")[2] or next(iter(words[at + 1 : at + 2]), "VALUE")
+    if key in KEYS and KEYS[key].type == "bool":
+        value = "false" if is_off else "true"
+    return f"No such option {option}: put {key}: {value} into a file for --config."
+
+
+def _file_keys(context: Any) -> Sequence[str]:
+    """Return the keys that the file of --config may have for the command of a context."""
+    callback = getattr(getattr(context, "command", None), "callback", None)
+    return tuple(getattr(callback, "file_keys", ()))
 
 
 def name_options(message: str, command: Any) -> str:
@@ -298,17 +373,19 @@ def keep_stdout_for_the_answer() -> Iterator[None]:
             os.close(answer)
 
 
-SCENARIO = ("base", "drivers", "observation", "action", "horizon")
+SCENARIO = ("base", "drivers", "observation", "action")
 """Fields of `Question` that are options of each command that drives an ego."""
-WORLD = (*SCENARIO, "noise", "weather")
+WORLD_IN_FILES = ("horizon", "noise", "weather", "collisions", "algo", "stats")
+RUN_IN_FILES = ("chunk", "core", "device", "ensemble_run", "executor", "address", "time_limit", "memory_limit")
+"""Fields that files alone give to commands that estimate: of the scenario and the ego, and of the run."""
 EGO_FILE = ("algo", "stats")
-ASKED = (*WORLD, "method", "measure", "gamma", "seed", "collisions", "device", "ensemble_run", "trust", *EGO_FILE)
-EVERYTHING = tuple(field.name for field in fields(Question) if field.name != "env_id")
 EXECUTOR = tuple(field.name for field in fields(ExecutorOptions))
 NOISE = {"on": True, "fixed": "fixed", "off": False}
 """Words of --noise for the `noise` argument of `DrivingProblem`."""
 KINDS: dict[str, Any] = {"noise": Literal["on", "fixed", "off"], "executor": Literal["local", "ray"] | None}
 """Types of options of which the fields have another."""
+OWNERS = {field.name: owner for owner in (Question, ExecutorOptions) for field in fields(owner)}
+"""The class that has a field."""
 
 
 def read_count(text: str) -> int:
@@ -319,6 +396,11 @@ def read_count(text: str) -> int:
         raise typer.BadParameter(f"expected a whole number, such as 10000 or 1e4, got {text!r}.") from None
 
 
+def split_words(*texts: str) -> list[str]:
+    """Return the words of texts in which commas stand between words."""
+    return [word.strip() for text in texts for word in text.split(",") if word.strip()]
+
+
 def read_environment(text: str | None) -> str | None:
     """Return the id of an environment with its namespace, where it was typed without."""
     from rare_envs.scenarios.registry import complete_id
@@ -326,69 +408,92 @@ def read_environment(text: str | None) -> str | None:
     return None if text is None else complete_id(text)
 
 
-def option_of(name: str, owner: type[Any] = Question, **changes: Any) -> Any:
+def option_of(name: str, **changes: Any) -> Any:
     """Return the option of a field, with changes to what `typer.Option` is told."""
-    field = next(each for each in fields(owner) if each.name == name)
+    field = next(each for each in fields(OWNERS[name]) if each.name == name)
     about = {key: field.metadata[key] for key in ("help", "show_default") if key in field.metadata} | changes
     if field.metadata.get("count"):
         return Option(parser=read_count, metavar="INTEGER", **about)
-    return Option(field.metadata.get("flags", f"--{option_name(field).replace('_', '-')}"), **about)
+    return Option(f"--{option_name(field).replace('_', '-')}", **about)
 
 
 EnvArgument = Annotated[
-    str, Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", callback=read_environment)
+    str,
+    Argument(
+        metavar="SCENARIO",
+        help="Scenario: CutIn, cut-in and rare_envs/CutIn-v1 are the same.",
+        callback=read_environment,
+    ),
 ]
-EgoArgument = Annotated[str, Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+EgoArgument = Annotated[str, Argument(metavar="EGO", help="Policy under test, as for estimate --ego.")]
 RunArgument = Annotated[Path, Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
 ForceOption = Annotated[bool, Option("--force", help="Replace what is there already.")]
-DetailsOption = Annotated[
-    bool, Option("--details", help="Print all intervals, and all parameters of the most likely failure.")
-]
+DetailsOption = Annotated[bool, Option("--details", help="Print the method, all intervals, parameters and remarks.")]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object and nothing else.")]
 
 
-def command(*names: str, stopped: str = "") -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:
+def command(
+    *names: str, more: Sequence[str] = (), texts: Sequence[str] = (), stopped: str = "", **about: Mapping[str, str]
+) -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:
     """Let a function be a command of Typer: the answer that it returns, if any, is printed, as JSON with --json.
 
-    Its parameter `asked` becomes the options of these fields of `Question`, `places` those of `ExecutorOptions`, and it
-    gets a mapping of them; `typed` gets the names of what was typed. `stopped` is said of an early interruption.
+    Its parameter `asked` becomes the options of these fields of `Question` and `ExecutorOptions`, and it gets a mapping
+    of them and of `more`, which are in the file of --config alone. The file may give all of these, and parameters of
+    the function that are `texts`. `typed` gets the names of what was typed or filed. `stopped` is said of an early
+    interruption. `about` has the words of options that are others than those of the fields.
     """
-    groups: dict[str, tuple[type[Any], tuple[str, ...]]] = {
-        "asked": (Question, names),
-        "places": (ExecutorOptions, EXECUTOR),
-    }
+    keys = [option_name(field) for owner in (Question, ExecutorOptions) for field in fields(owner)]
+    keys = [key for key in keys if KEYS[key].name in (*names, *more)]
 
     def decorate(function: Callable[..., Answer | None]) -> Callable[..., None]:
         signature = inspect.signature(function, eval_str=True)
         taken = signature.parameters
 
         @functools.wraps(function)
-        def run(context: typer.Context, as_json: bool = False, **values: Any) -> None:
-            for group in groups.keys() & taken.keys():
-                known = {name: values.pop(name) for name in groups[group][1]}
-                values[group] = {name: NOISE[value] if name == "noise" else value for name, value in known.items()}
-            if "typed" in taken:
-                sources = {name: context.get_parameter_source(name) for name in context.params}
-                values["typed"] = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+        def run(context: typer.Context, as_json: bool = False, config: Path | None = None, **values: Any) -> None:
+            sources = {name: context.get_parameter_source(name) for name in context.params}
+            typed = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+            filed = {} if config is None else read_question_file(config, keys, texts)
+            known = {name: getattr(OWNERS[name], name, None) for name in more}
+            for name in names:
+                value = values.pop(name)
+                known[name] = NOISE[value] if name == "noise" else value
+            for name, value in filed.items():
+                if name in known and name not in typed:
+                    known[name] = value
+                elif name in texts and name not in typed:
+                    values[name] = [value] if "list" in str(taken[name].annotation) else value
+            values |= {"asked": known} if "asked" in taken else {}
+            values |= {"typed": typed | set(filed)} if "typed" in taken else {}
             answering(functools.partial(function, **values), as_json, stopped, values.get("details", False))
 
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
         parameters = [keyword("context", annotation=typer.Context)]
         for name, parameter in taken.items():
-            if name in groups:
-                owner, known = groups[name]
-                kinds: Any = {**get_type_hints(owner), **KINDS}
-                for each in known:
-                    default = "on" if each == "noise" else getattr(owner, each)
+            if name == "asked":
+                kinds: Any = {**get_type_hints(Question), **get_type_hints(ExecutorOptions), **KINDS}
+                for each in names:
+                    default = "on" if each == "noise" else getattr(OWNERS[each], each)
                     parameters.append(
-                        keyword(each, default=default, annotation=Annotated[kinds[each], option_of(each, owner)])
+                        keyword(
+                            each,
+                            default=default,
+                            annotation=Annotated[kinds[each], option_of(each, **about.get(each, {}))],
+                        )
                     )
-            elif name != "typed":
+            elif name not in ("typed", *(text for text in texts if parameter.annotation in (str, str | None))):
                 parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if more:
+            only = ", ".join(key for key in keys if KEYS[key].name in more)
+            help = (
+                f"YAML file of options (key: value), which the command line overrides, and of further settings: {only}."
+            )
+            parameters.append(keyword("config", default=None, annotation=Annotated[Path | None, Option(help=help)]))
         if signature.return_annotation is not None:
             parameters.append(keyword("as_json", default=False, annotation=JsonOption))
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in parameters}
+        run.file_keys = (*keys, *texts)  # type: ignore[attr-defined]
         del run.__wrapped__
         return run
 

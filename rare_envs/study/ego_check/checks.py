@@ -306,7 +306,7 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
     f = evaluator.evaluate(probe.problem.base.sample(BATCH_ROWS, np.random.default_rng(2)))
     if evaluator.faults:
         failed = f"fails on {len(evaluator.faults)} of {BATCH_ROWS} ordinary scenarios: {evaluator.faults[0].reason}"
-        advice = "fix it, or count such scenarios with --on-error failure or bound"
+        advice = "fix it, or count such scenarios by on_error: failure or bound in a file for --config"
         yield Finding("driving", "fail", failed, advice)
         return
     crashed = float((f == -1.0).mean())

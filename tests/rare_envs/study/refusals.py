@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import yaml
 from typer.testing import Result
 
 Cli = Callable[..., Result]
 FOLLOWING = "rare_envs/CarFollowing-v0"
+FILES = tempfile.TemporaryDirectory()
+"""Folder of files for --config, which goes with the process."""
+
+
+def in_file(**settings: Any) -> tuple[str, str]:
+    """Return the words of a command whose file of --config has these settings."""
+    text = yaml.safe_dump(settings, sort_keys=True)
+    path = Path(FILES.name, f"{abs(hash(text))}.yaml")
+    path.write_text(text, encoding="utf-8")
+    return "--config", str(path)
+
+
 SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 2000)
 
 

@@ -29,6 +29,7 @@ from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.run_folder import JOURNAL
 from rare_envs.study.writing import begin_journal
 from tests.rare_envs.study.conftest import write_base
+from tests.rare_envs.study.refusals import in_file
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 ODD: tuple[Any, ...] = (
@@ -39,7 +40,7 @@ ODD: tuple[Any, ...] = (
 
 QUICK, MANY = 4, 150
 Damage = Callable[[bytes, np.random.Generator], bytes]
-SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", "20", "--horizon", "0.5")
+SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", "20", *in_file(horizon=0.5))
 YAML = "env: rare_envs/CarFollowing-v0\nmethod: mc\nmax-sim: 20\nhorizon: 0.5\nseed: 1\ntarget-cov: 0.1\n"
 NGSIM = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Length,v_Width,v_Class,v_Vel,Lane_ID\n"
 MARK = "ran"
@@ -135,7 +136,7 @@ def damage_yaml(content: bytes, rng: np.random.Generator) -> bytes:
 
 KINDS = {
     "result read by replay": Kind("run/result.json", ("replay", "run"), damage_json),
-    "result read by plan": Kind("run/result.json", ("plan", "run", "--cov", "0.05"), damage_json),
+    "result read by plan": Kind("run/result.json", ("estimate", "run", "--plan"), damage_json),
     "result read by report": Kind("run/result.json", ("report", "run"), damage_json),
     "study": Kind("run/study.json", ("report", "run"), damage_json),
     "episodes": Kind("run/episodes.parquet", ("report", "run")),
@@ -149,7 +150,7 @@ KINDS = {
     "question": Kind("study.yaml", ("estimate", "--config", "study.yaml"), damage_yaml),
     "base": Kind("base.json", (*SMALL, "--base", "base.json"), damage_json),
     "policy": Kind("ego.zip", (*SMALL, "--ego", "ego.zip")),
-    "statistics": Kind("mine.pkl", (*SMALL, "--ego", "ego.zip", "--stats", "mine.pkl")),
+    "statistics": Kind("mine.pkl", (*SMALL[:-2], "--ego", "ego.zip", *in_file(horizon=0.5, stats="mine.pkl"))),
     "network": Kind("ego.onnx", (*SMALL, "--ego", "ego.onnx"), needs="onnxruntime"),
     "drivers": Kind("drivers.safetensors", (*SMALL, "--drivers", "drivers.safetensors")),
     "recording": Kind("tracks.csv", ("fit", "--ngsim", "tracks.csv", "--out", "bases"), damage_table),
@@ -191,7 +192,7 @@ def write_policy(folder: Path) -> None:
     sb3.PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu").save(folder / "ego.zip")
     env.save(str(folder / "mine.pkl"))
     if importlib.util.find_spec("onnxruntime"):
-        words = ("export-ego", folder / "ego.zip", folder / "ego.onnx", "--stats", folder / "mine.pkl")
+        words = ("export", folder / "ego.zip", folder / "ego.onnx", "--stats", folder / "mine.pkl")
         assert cli(*map(str, words)).exit_code == 0
 
 

@@ -19,6 +19,7 @@ from agents.safe_pickle import find_origin_risks
 from rare_envs.study.arguments import Question
 from rare_envs.study.ego_check import Finding, exit_code
 from rare_envs.study.ego_check.subprocess_check import check_ego, run_checks
+from tests.rare_envs.study.refusals import in_file
 
 Cli = Callable[..., Result]
 ENV = "rare_envs/CarFollowing-v0"
@@ -200,7 +201,7 @@ def test_an_ego_that_is_not_what_it_says_is_one_line_and_one_finding(
     (tmp_path / "liars_here.py").write_text(LIARS)
     for name in [line.partition(" =")[0] for line in LIARS.splitlines() if " = made(" in line]:
         ego = f"liars_here:{name}"
-        result = cli("estimate", ENV, "--ego", ego, "--method", "mc", "--max-sim", 5, "--horizon", 1)
+        result = cli("estimate", ENV, "--ego", ego, "--method", "mc", "--max-sim", 5, *in_file(horizon=1))
         assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1), (name, result.output)
         found = [each for each in run_checks(Question(env_id=ENV, ego=ego, horizon=1.0)) if isinstance(each, Finding)]
         assert exit_code(found) == 2, (name, found)
@@ -237,8 +238,7 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
         ["estimate", ENV, "--ego", saved],
         ["estimate", ENV, "--ego", f"noisy:{saved}?lag=1"],
         ["compare", "idm", saved, ENV],
-        ["serve-ego", saved],
-        ["export-ego", saved, saved.with_suffix(".onnx")],
+        ["export", saved, saved.with_suffix(".onnx")],
     ]
     for words in commands:
         said = cli(*words)

@@ -18,9 +18,21 @@ from rare_envs.study import evaluate, question, writing
 from samplers import estimation
 from samplers.journal import Journal
 from tests.rare_envs.study.fitted_files import write_fitted
-from tests.rare_envs.study.refusals import FOLLOWING, Cli
+from tests.rare_envs.study.refusals import FOLLOWING, Cli, in_file
 
-WORDS = ("estimate", FOLLOWING, "--method", "mc", "--horizon", "1", "--gamma", "2", "--max-sim", "600", "--seed", "0")
+WORDS = (
+    "estimate",
+    FOLLOWING,
+    "--method",
+    "mc",
+    *in_file(horizon=1),
+    "--gamma",
+    "2",
+    "--max-sim",
+    "600",
+    "--seed",
+    "0",
+)
 NOTHING = "Stopped: no estimate yet, no simulation made."
 LOST = "With --out finished simulations would have been kept."
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,9 @@ import rare_envs
 from rare_envs.egos.needs import EgoWarning
 from rare_envs.study import BadInput, Question, prepare
 from rare_envs.study.arguments import KEYS, list_arguments, read_question_file
-from rare_envs.study.cli.shell import EVERYTHING
 from rare_envs.study.ego_check import Finding
 from rare_envs.study.ego_check.subprocess_check import run_checks
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
 
 STRICT = """
 import numpy as np, egos_here
@@ -76,7 +75,7 @@ def test_a_threshold_that_nothing_or_only_collisions_reach_is_told() -> None:
 def test_an_ego_that_sets_numpys_errors_sets_them_for_itself(cli: Cli, here: Path, risky: str) -> None:
     (here / "strict.py").write_text(STRICT)
     before = np.geterr()
-    words = ("--base", risky, "--max-sim", "2000", "--horizon", "2", "--gamma", "1", "--json")
+    words = ("--base", risky, "--max-sim", "2000", *in_file(horizon=2), "--gamma", "1", "--json")
     strict, usual = (cli("estimate", FOLLOWING, "--ego", ego, *words) for ego in ("strict:make", "egos_here:coasting"))
     assert strict.exit_code in (0, 3), strict.stderr
     assert json.loads(strict.stdout)["p"] == json.loads(usual.stdout)["p"]
@@ -86,7 +85,7 @@ def test_an_ego_that_sets_numpys_errors_sets_them_for_itself(cli: Cli, here: Pat
 def test_the_same_question_as_a_file_gives_the_same_answer(cli: Cli, risky: str, tmp_path: Path) -> None:
     file = tmp_path / "study.yaml"
     file.write_text(f"env: rare_envs/CarFollowing-v0\nbase: {risky}\nmethod: mc\nmax-sim: 200\nseed: 3\nnoise: off\n")
-    words = ("--base", risky, "--method", "mc", "--max-sim", 200, "--seed", 3, "--noise", "off", "--json")
+    words = ("--base", risky, "--method", "mc", "--max-sim", 200, "--seed", 3, *in_file(noise=False), "--json")
     typed = json.loads(cli("estimate", FOLLOWING, *words).stdout)
     filed = json.loads(cli("estimate", "--config", file, "--json").stdout)
     assert {**filed, "seconds": 0} == {**typed, "seconds": 0}
@@ -101,7 +100,7 @@ VALUES: tuple[tuple[str, dict[str, object]], ...] = (
     ("noise: off\nweather: yes\n", {"noise": False, "weather": True}),
     ("noise: fixed\nego: on\nbase: null\n", {"noise": "fixed", "ego": "on", "base": None}),
     ("base: 'null'\n", {"base": "null"}),
-    ("confidence: 0.9\nworkers: 2e0\ntime-limit: 60\n", {"gate_confidence": 0.9, "workers": 2, "time_limit": 60.0}),
+    ("confidence: 0.9\nworkers: 2e0\ntime-limit: 60\n", {"confidence": 0.9, "workers": 2, "time_limit": 60.0}),
     ('{"env": "a", "seed": 3}', {"seed": 3}),
 )
 
@@ -130,7 +129,7 @@ UNUSABLE = (
     ("ego: null\n", "Expected ego to be a text, got None"),
     ("base: [unclosed\n", "is no YAML"),
     ("executor: cloud\n", "executor to be local or ray, got 'cloud'"),
-    ("confidence: 0.9\n", "Expected --confidence together with --max-p or --max-rate"),
+    ("confidence: 95\n", "Expected --confidence above 0 and below 1"),
 )
 
 
@@ -144,5 +143,5 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_line(cli: Cli, tmp_path: P
 
 
 def test_every_option_can_be_in_a_file_and_is_in_the_table() -> None:
-    assert set(EVERYTHING) <= {field.name for field in KEYS.values()}
+    assert {field.name for field in fields(Question)} <= {field.name for field in KEYS.values()}
     assert all(f"| `{key}` |" in list_arguments() for key in KEYS)

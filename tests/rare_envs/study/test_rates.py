@@ -314,7 +314,7 @@ def test_traffic_that_nobody_calibrated_is_said_to_have_no_calibration(bases: di
         (event_of("us101-test"), "us101-test"),
         (event_of(own), own),
         (event_of("us101", "rare_envs/CutIn-v0"), "us101"),
-        (event_of("us101", horizon=2.0), "us101 with --horizon"),
+        (event_of("us101", horizon=2.0), "us101 with horizon"),
     ):
         assert found.calibration is None
         assert describe_calibration(found) == f"not calibrated: human driver model not measured in {Path(traffic).name}"

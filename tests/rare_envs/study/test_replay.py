@@ -27,7 +27,7 @@ from rare_envs.study.plots import (
     write_film,
 )
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, in_file
 
 CUT_IN, NEWEST = "rare_envs/CutIn-v0", "rare_envs/CutIn-v1"
 
@@ -147,7 +147,17 @@ def test_a_film_of_every_scenario_without_a_crash(env_id: str, tmp_path: Path) -
 
 
 def test_sensitivity_is_shown_and_written(cli: Cli, tmp_path: Path) -> None:
-    words = ("estimate", FOLLOWING, "--base", "us101-gap", "--max-sim", 2000, "--sensitivity", "--out", tmp_path)
+    words = (
+        "estimate",
+        FOLLOWING,
+        "--base",
+        "us101-gap",
+        "--max-sim",
+        2000,
+        *in_file(sensitivity=True),
+        "--out",
+        tmp_path,
+    )
     shown = cli(*words)
     assert shown.exit_code in (0, 3) and "importance of the parameters of x" in shown.stdout
     saved = json.loads((tmp_path / "result.json").read_text())["sensitivity"]

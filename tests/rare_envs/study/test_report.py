@@ -16,7 +16,7 @@ from rare_envs.study import Question, prepare, run
 from rare_envs.study.report import N_THRESHOLDS, compute_threshold_curve
 from rare_envs.study.run_folder import read_failures
 from rare_envs.study.text import print_report
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, in_file
 
 
 @pytest.mark.parametrize("method", ["mc", "two-stage", "adss"])
@@ -61,7 +61,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     words = (*SMALL[:-1], 400, "--base", risky, "--ego", f"egos_here:{ego}", "--out", here / "run")
     found = {}
     for on_error in ("bound", "failure"):
-        result = cli(*words, "--on-error", on_error, "--force", "--details")
+        result = cli(*words, *in_file(on_error=on_error), "--force", "--details")
         assert result.exit_code == 3, result.output  # the number is doubtful
         found[on_error] = json.loads((here / "run" / "result.json").read_text())
         assert f"the ego gave no answer in {found[on_error]['n_faults']} scenarios" in result.stdout
@@ -92,7 +92,7 @@ def test_plain_monte_carlo_is_advised_where_it_would_find_enough(
 
 def test_the_ratio_of_an_ego_that_brakes_and_one_that_does_not(cli, risky, here):
     words = ("compare", "egos_here:coasting", "idm", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 2000)
-    result = cli(*words, "--collisions", "any", "--out", "run", "--json")
+    result = cli(*words, *in_file(collisions="any"), "--out", "run", "--json")
     assert result.exit_code in (0, 3), result.output
     found = json.loads(result.stdout)
     assert json.loads((here / "run" / "comparison.json").read_text()) == found

@@ -33,7 +33,7 @@ from samplers.journal import COLUMNS, Journal, _Row
 from samplers.workers import ExecutorError
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
 from tests.samplers.real_executors import case
 
 FRAIL = """
@@ -214,7 +214,7 @@ def test_an_executor_that_does_not_start_costs_a_resumed_run_nothing(asked: Ques
 
 
 def test_a_run_that_was_stopped_before_its_first_simulation_says_what_to_do(cli: Cli, frail: Path) -> None:
-    words = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 20, "--horizon", 1, "--out", "run")
+    words = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 20, *in_file(horizon=1), "--out", "run")
     RUN.mkdir()
     assert_refused(cli("resume", "run"), "stopped before its first simulations", "ive the command again.")
     begin_journal(RUN, Question(env_id=FOLLOWING)).close()
@@ -267,7 +267,7 @@ def test_a_remote_ego_that_is_killed_for_good_and_started_later(
     pytest.importorskip("zmq", reason="the extra remote is optional")
     (frail / "served.py").write_text(FRAIL)
     paths = os.pathsep.join([str(Path(rare_envs.__file__).parents[1]), str(frail)])
-    main = [sys.executable, "-m", "rare_envs", "serve-ego", "served:make", "--bind", "tcp://127.0.0.1:*"]
+    main = [sys.executable, "-m", "agents.remote", "served:make", "--bind", "tcp://127.0.0.1:*"]
 
     def serve() -> tuple[subprocess.Popen[str], str]:
         environment = {**os.environ, "PYTHONPATH": paths}
@@ -376,7 +376,7 @@ def test_an_ego_that_changes_the_working_directory(
 
 # Commands that are killed
 
-WORDS = ["--method", "mc", "--max-sim", "6000", "--gamma", "1", "--horizon", "2", "--seed", "5"]
+WORDS = ["--method", "mc", "--max-sim", "6000", "--gamma", "1", "--seed", "5", *in_file(horizon=2)]
 PAUSE = 0.03
 """Seconds after a chunk: 21 kills within 0.05 s of a chunk, or 0.3 s of the start, leave most of the 120 chunks."""
 KILLS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
@@ -449,7 +449,7 @@ def test_killed_at_random_times_it_gives_the_same_files(
     assert_same_files(tmp_path / "run", whole)
 
 
-CHUNK = ("--chunk", str(TILE))
+CHUNK = in_file(horizon=2, chunk=TILE)
 
 
 @pytest.mark.parametrize("whole", [CHUNK], indirect=True, ids=[""])

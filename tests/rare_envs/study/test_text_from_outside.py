@@ -14,10 +14,11 @@ from agents.files import SHIPPED
 from rare_envs.plugins import clean_text
 from rare_envs.study.cli.app import app
 from rare_envs.study.plots import saved_figure
+from tests.rare_envs.study.refusals import in_file
 
 NAME = "$\\frac{$ [red]\x1b[2J\x1b]0;a\x07\u202e<b>\n"
 SHOWN = r"$\frac{$ [red]\x1b[2J\x1b]0;a\x07\u202e<b>"
-SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", "20", "--horizon", "0.5")
+SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", "20", *in_file(horizon=0.5))
 
 
 def assert_plain(text: str) -> None:
@@ -32,7 +33,7 @@ def test_a_run_of_a_file_with_a_strange_name_is_shown_and_kept(tmp_path: Path, m
     for words in (
         (*SMALL, "--gamma", "12", "--ego", f"{NAME}.safetensors", "--out", str(folder)),
         ("report", str(folder), "--figures", "svg"),
-        ("corpus", "add", str(folder), "--most", "1"),
+        ("corpus", "add", str(folder), "--limit", "1"),
         ("corpus", "run", "--ego", f"{NAME}.safetensors", "--junit", "junit.xml"),
         ("replay", f"no {NAME}"),
         ("check-ego", f"no {NAME}", "rare_envs/CarFollowing-v0"),

@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import json
 import sys
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from typer.testing import CliRunner
 
 from agents import load_driver, read_provenance
 from agents.learned.networks import WHITE_NOISE, head_weights
-from rare_envs.study.cli.app import app
 from tests.training.data.recordings import simulate, write_highd
 from tests.training.imitation.synthetic_scenes import TINY, scene, scenes, tiny
 from training.imitation import __main__ as command_line
@@ -121,20 +119,6 @@ def test_a_command_repeats_its_training_and_says_what_is_missing(monkeypatch, tm
         assert result.exit_code == 0, result.output
         source, settings, _, how = found.pop()
         assert (source, settings, how["device"]) == (Source("data", Path("tables")), config, device)
-
-
-def test_the_shared_command_line_trains_drivers(monkeypatch, tmp_path, capsys):
-    asked = []
-    monkeypatch.setattr(
-        "training.imitation.train.train_driver", lambda *given, **how: asked.append(given[:2]) or tmp_path / "it"
-    )
-    words = ["train-drivers", "--data", "tables", "--method", "gail", "--updates", "7", "--json"]
-    with pytest.raises(SystemExit) as stop:
-        app([*words, "--out", str(tmp_path / "run")], prog_name="rare-envs")
-    assert stop.value.code == 0
-    assert asked == [(Source("data", Path("tables")), Config("gail", 0, 7))]
-    answer = json.loads(capsys.readouterr().out)
-    assert answer == {"driver": str(tmp_path / "it"), "method": "gail", "seed": 0}
 
 
 def test_logs_go_to_tensorboard(data, tmp_path, monkeypatch):

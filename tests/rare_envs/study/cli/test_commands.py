@@ -25,14 +25,14 @@ import training.fit.recordings as fitting
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.startup import advise_install
+from rare_envs.study.cli.egos_and_runs import FAILS
 from rare_envs.study.cli.listing import TITLES
-from rare_envs.study.cli.runs import FAILS
 from rare_envs.study.corpus import read_corpus
 from rare_envs.study.ego_check import VERDICTS
 from rare_envs.study.plots import CURVES_HEIGHT
 from rare_envs.study.run_folder import read_failures
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
 
 
 def test_list_shows_what_there_is(cli: Cli) -> None:
@@ -79,11 +79,15 @@ def test_all_names_fit_a_screen(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_one_kind_is_explained_alone(cli: Cli) -> None:
     whole = json.loads(cli("list", "all", "--json").stdout)
-    cut_in = {"environments": {"rare_envs/CutIn-v0": whole["environments"]["rare_envs/CutIn-v0"]}}
+    bases = json.loads(cli("list", "bases", "--json").stdout)["bases"]
+    cut_in = {
+        kind: {"rare_envs/CutIn-v0": of["rare_envs/CutIn-v0"]}
+        for kind, of in (("environments", whole["environments"]), ("bases", bases))
+    }
     for what, there, absent, expected in (
         ("egos", "rule-based driver", "lateral_offset", {"egos": whole["egos"]}),
         ("CutIn-v0", "us101-closing", "CarFollowing", cut_in),
-        ("rare_envs/CutIn-v0", "lateral_offset", "CarFollowing", cut_in),
+        ("cut-in-v0", "lateral_offset", "CarFollowing", cut_in),
     ):
         shown = cli("list", what).stdout
         assert there in shown and absent not in shown
@@ -99,12 +103,12 @@ def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.
         ),
     }
     monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
-    text = " ".join(cli("bases", "rare_envs/HardBrake-v0").stdout.split())
-    assert "us101 (the default) fitted to 42 events of 40 scenes, 30 refits" in text
+    text = " ".join(cli("list", "rare_envs/HardBrake-v0").stdout.split())
+    assert "us101 (default) fitted to 42 events of 40 scenes, 30 refits" in text
     assert "site site of hard_brake, 2005-06-15" in text
     assert "fit BIC 1,086.8, held-out log likelihood -14.60 per event" in text
     assert "7.4 per hour, 0.19 per km: 42 in 5.64 h (events of a test)" in text
-    assert "recorded / expected TTC < 5 s 2 / 7.5" in text
+    assert "recorded / expected: TTC < 5 s 2 / 7.5" in text
     assert "plain frequency not known, no rate per hour or km: nobody counted" in text
 
 
@@ -134,9 +138,9 @@ def test_an_ego_is_trained_on_with_the_failures_of_its_runs(cli: Cli, risky: str
 
 def test_an_ego_is_trained_in_all_scenarios_of_risk(cli: Cli, tmp_path: Path) -> None:
     ego = tmp_path / "ego.zip"
-    words = ("--steps", 16, "--num-envs", 8, "--algo", "a2c", "--horizon", 0.5, "--out", ego)
+    words = ("--steps", 16, "--num-envs", 8, "--algo", "a2c", "--out", ego, *in_file(horizon=0.5))
     printed = cli("train-ego", "all", *words, "--base", "us101").stdout
-    assert printed.endswith(f"Next: rare-envs risk {ego} --base cut_in=us101 --base hard_brake=us101\n")
+    assert printed.endswith(f"risk {ego} --base us101 --config FILE, with horizon: 0.5 in the file\n")
     answer = json.loads(cli("train-ego", "HardBrake-v0", "CutIn-v1", *words, "--force", "--shares", "--json").stdout)
     assert answer["env_id"] == ["rare_envs/HardBrake-v0", "rare_envs/CutIn-v1"]
 
@@ -174,13 +178,13 @@ def test_an_ego_is_exported(cli: Cli, tmp_path: Path, monkeypatch: pytest.Monkey
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "onnx", None)
         said = f"Exporting needs onnx and onnxruntime: {advise_install('onnx')}."
-        assert_refused(cli("export-ego", model, out), said)
+        assert_refused(cli("export", model, out), said)
     assert not out.exists()
     pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
     pytest.importorskip("onnx", reason="the extra onnx is optional")
-    report = json.loads(cli("export-ego", model, out, "--json").stdout)
+    report = json.loads(cli("export", model, out, "--json").stdout)
     assert report["onnx"] == str(out) and report["largest_difference"] <= report["tolerance"]
-    assert cli("export-ego", model, out, "--force").stdout == (
+    assert cli("export", model, "--out", out, "--force").stdout == (
         f"Wrote {out}: its actions differ by {report['largest_difference']:.1e} at most on 1,440 random observations.\n"
     )
 
@@ -284,10 +288,10 @@ def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) ->
 def test_p_under_other_bases(cli: Cli, here: Path) -> None:
     """A near one is answered, a far one refused with its reason; one that is not there before any simulation."""
     base, near, far = (write_fitted(here / f"{k}.json", "hard_brake", shift=k) for k in (0.0, 0.2, 8.0))
-    words = (*BRAKE, "--base", base, "--also-under", f"{near}, {far}")
+    words = (*BRAKE, "--base", base, *in_file(also_under=f"{near}, {far}"))
     one, other = json.loads(cli(*words, "--json").stdout)["other_bases"]
     assert one["refused"] == "" and one["interval"][0] < one["p"] < one["interval"][1]
     assert "effective" in other["refused"] or "worth" in other["refused"]
     text = " ".join(cli(*words).stdout.split())
     assert f"with {near} " in text and f"with {far} not known: " in text
-    assert_refused(cli(*BRAKE, "--base", base, "--also-under", "nowhere"), "nowhere")
+    assert_refused(cli(*BRAKE, "--base", base, *in_file(also_under="nowhere")), "nowhere")

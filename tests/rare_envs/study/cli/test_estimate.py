@@ -25,7 +25,7 @@ from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.estimate import ESTIMATE_FILE
 from rare_envs.study.run_folder import CRASH, read_failures
 from samplers.executors import LocalProcesses
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
 
 
 def test_a_doubtful_number_says_so_and_exits_with_3(cli: Cli, safe: str) -> None:
@@ -101,8 +101,10 @@ def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: s
 
 
 def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
-    words = ("estimate", "rare_envs/CutIn-v0", "--weather", "--observation", "camera+lidar", "--method", "mc")
-    found = json.loads(cli(*words, "--max-sim", 40, "--horizon", 1, "--out", tmp_path / "run", "--json").stdout)
+    words = ("estimate", "rare_envs/CutIn-v0", "--observation", "camera+lidar", "--method", "mc")
+    found = json.loads(
+        cli(*words, "--max-sim", 40, *in_file(weather=True, horizon=1), "--out", tmp_path / "run", "--json").stdout
+    )
     assert found["question"]["weather"] is True
     assert found["question"]["observation"] == "camera+lidar"
 
@@ -110,14 +112,14 @@ def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
 def test_a_plan_from_pilots_and_one_from_a_folder(
     cli: Cli, risky: str, safe: str, finished_run: Path, tmp_path: Path
 ) -> None:
-    options = ("--base", risky, "--method", "mc", "--horizon", 4)
-    answer = json.loads(cli("plan", FOLLOWING, *options, "--pilot", 2000, "--cov", 0.05, "--json").stdout)
+    options = ("--base", risky, "--method", "mc", *in_file(horizon=4), "--plan", "--max-sim", 2000)
+    answer = json.loads(cli("estimate", FOLLOWING, *options, "--target-cov", 0.05, "--json").stdout)
     (planned,) = answer["runs"]
     assert planned["method"] == "mc" and planned["n_sim"] > 2000 and planned["seconds"] > 0.0
     shutil.copytree(finished_run, tmp_path / "run")
-    text = cli("plan", tmp_path / "run", "--target-cov", 0.05).stdout  # as `estimate` names it
+    text = cli("estimate", tmp_path / "run", "--plan", "--target-cov", 0.05).stdout
     assert f"{planned['n_sim']:,} simulations" in text and "--target-cov 0.05" in text  # the same seed, the same pilot
-    none = cli("plan", FOLLOWING, "--base", safe, "--method", "mc", "--pilot", 200)
+    none = cli("estimate", FOLLOWING, "--base", safe, "--method", "mc", "--plan", "--max-sim", 200)
     assert none.exit_code == 2 and none.stdout == ""
     assert "found no failure" in none.stderr.splitlines()[-1]  # behind the bar
 
@@ -172,7 +174,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_policy_from_there_is_estimated_there(cli: Cli, saved: Path, tmp_path: Path) -> None:
-    words = ("estimate", "highway-fast-v0", "--ego", saved, "--method", "mc", "--max-sim", 4, "--horizon", 2)
+    words = ("estimate", "highway-fast-v0", "--ego", saved, "--method", "mc", "--max-sim", 4, *in_file(horizon=2))
     result = cli(*words, "--out", tmp_path / "run", "--json")
     assert result.exit_code in (0, 3), result.output
     answer = json.loads(result.stdout)
@@ -193,18 +195,20 @@ def test_a_policy_of_another_config_is_estimated_in_it(cli: Cli, tmp_path: Path)
     path = tmp_path / "wide.zip"
     env: Any = gym.make("highway-fast-v0", config=config)
     DQN("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, buffer_size=10, seed=0, device="cpu").save(path)
-    words = ("estimate", "highway-fast-v0", "--ego", path, "--method", "mc", "--max-sim", 2, "--horizon", 1, "--json")
-    assert_refused(cli(*words), "--env-config FILE")
+    words = ("estimate", "highway-fast-v0", "--ego", path, "--method", "mc", "--max-sim", 2, "--json")
+    assert_refused(cli(*words, *in_file(horizon=1)), "env_config: FILE")
     for name in ("wide.json", "wide.yaml"):
-        answer = json.loads(cli(*words, "--env-config", tmp_path / name).stdout)
+        answer = json.loads(cli(*words, *in_file(horizon=1, env_config=str(tmp_path / name))).stdout)
         assert (answer["n_sim"], answer["env_config"]["observation"]) == (2, config["observation"])
     for name, said in (("twice.yaml", "*name"), ("list.json", "keys and values"), ("code.json", "--trust")):
-        assert_refused(cli(*words, "--env-config", tmp_path / name), said)
-    assert_refused(cli("estimate", "CutIn-v0", "--env-config", tmp_path / "wide.json"), "environment of HighwayEnv")
+        assert_refused(cli(*words, *in_file(env_config=str(tmp_path / name))), said)
+    assert_refused(
+        cli("estimate", "CutIn-v0", *in_file(env_config=str(tmp_path / "wide.json"))), "environment of HighwayEnv"
+    )
 
 
 def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
-    words = ("estimate", "highway-fast-v0", "--method", "mc", "--max-sim", 4, "--horizon", 1, "--gamma", -99)
+    words = ("estimate", "highway-fast-v0", "--method", "mc", "--max-sim", 4, *in_file(horizon=1), "--gamma", -99)
     answer, text = json.loads(cli(*words, "--json").stdout), cli(*words)
     assert (answer["status"], answer["doubtful"], len(answer["warnings"])) == ("no_hits", False, 1)
     assert text.exit_code == 0 and "arning" not in text.stdout and "none in 4 simulations" in text.stdout
@@ -214,8 +218,18 @@ def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
 @pytest.mark.usefixtures("full_pictures")
 def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""
-    words = "--measure lidar_ttc --gamma 1 --horizon 2 --ego mgail --drivers gail --noise fixed --method mc".split()
-    result = cli("estimate", "rare_envs/Highway-v0", *words, "--max-sim", 256, "--details", "--out", tmp_path)
+    words = "--measure lidar_ttc --gamma 1 --ego mgail --drivers gail --method mc".split()
+    result = cli(
+        "estimate",
+        "rare_envs/Highway-v0",
+        *words,
+        *in_file(horizon=2, noise="fixed"),
+        "--max-sim",
+        256,
+        "--details",
+        "--out",
+        tmp_path,
+    )
     assert result.exit_code in (0, 3), result.output
     assert "the drivers' noise is one fixed sequence" in result.stdout
     assert max(map(len, result.stdout.splitlines())) < 200
