@@ -134,7 +134,7 @@ def print_overview(entries: dict[str, Any]) -> None:
         console.print(table)
     console.print(
         "What they mean: rare-envs list egos (or another kind, or all).\n"
-        "A scenario with its traffic models: rare-envs list CutIn. All traffic models: rare-envs list bases."
+        "Traffic models: rare-envs list CutIn (of one scenario) or rare-envs list bases."
     )
 
 

@@ -138,9 +138,9 @@ def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monke
         result = cli(*words, "--out", "both")
     assert result.exit_code == 143
     assert result.stderr.startswith("Stopped after 10,000 simulations: P[A or B fails] so far ")
-    assert "20,000 simulations are kept; go on with: the same command again, without --force.\n" in result.stderr
-    both, whole = (json.loads(cli(*words, "--out", folder, "--json").stdout) for folder in ("both", "whole"))
-    assert both == whole
+    assert "25,000 simulations are kept; go on with: rare-envs resume both\n" in result.stderr
+    both = json.loads(cli("resume", "both", "--workers", 1, "--json").stdout)
+    assert both == json.loads(cli(*words, "--out", "whole", "--json").stdout)
     assert sorted(path.name for path in Path("both").iterdir()) == ["comparison.json", "failures.csv"]
     stop_after(300, monkeypatch)
     assert_stopped(cli(*words), "Stopped: no estimate yet, the first batch of simulations was not complete.")

@@ -69,7 +69,7 @@ def test_what_counts_no_collisions_has_no_rate(bases: dict[str, str]) -> None:
         ("--gamma 1", {"gamma": 1.0}),
         ("--gamma -0.5", {"measure": "margin", "gamma": -0.5}),
         ("--gamma -2", {"measure": "clearance", "gamma": -2.0}),
-        ("--collisions any", {"collisions": "any"}),
+        ("collisions: any", {"collisions": "any"}),
     ):
         with pytest.raises(ValueError, match=said):
             find_frequency(replace(study, question=replace(study.question, **changes)))

@@ -55,8 +55,9 @@ def test_a_killed_run_of_a_sum_goes_on_to_the_same_parts(tmp_path: Path, braking
     assert [part["name"] for part in whole["parts"]] == ["slowing", "stop"] and whole["p"] > 0
 
 
-def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
-    tmp_path: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("resumes", [True, False])
+def test_a_risk_that_was_stopped_is_resumed_or_goes_on_with_the_same_command(
+    resumes: bool, tmp_path: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped in the second scenario: nothing that was simulated is simulated again, and no journal is left."""
     monkeypatch.setattr(writing, "save_pictures", lambda path, report: None)
@@ -74,12 +75,12 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
     words = ("risk", "idm", *bases, "--method", "mc", "--max-sim", "120", "--seed", "4", "--out")
     stopped = cli(*words, tmp_path / "run")
     assert stopped.exit_code == 130
-    kept = "30 simulations are kept; go on with: the same command again, without --force. Done before: cut_in "
+    kept = f"30 simulations are kept; go on with: rare-envs resume {tmp_path / 'run'} Done before: cut_in "
     assert kept in stopped.stderr
     assert (tmp_path / "run" / "cut_in" / JOURNAL).exists() and not (tmp_path / "run" / "risk.json").exists()
     assert_refused(cli(*words, tmp_path / "run", "--seed", 5), "is of another question", "--force")
     most[0], before = 2000, made[0]
-    done = cli(*words, tmp_path / "run")
+    done = cli("resume", tmp_path / "run") if resumes else cli(*words, tmp_path / "run")
     assert done.exit_code in (0, 3) and done.stdout.startswith("idm: collisions per million km ")
     assert f"\nWrote        {tmp_path / 'run'}\n" in done.stdout and (tmp_path / "run" / "risk.png").exists()
     assert 90 <= made[0] - before < 120  # a few are made again to see that f is what it was
@@ -88,6 +89,7 @@ def test_a_risk_that_was_stopped_goes_on_with_the_same_command(
     assert cli(*words, tmp_path / "whole").exit_code in (0, 3)
     assert answer(tmp_path / "run", "risk.json") == answer(tmp_path / "whole", "risk.json")
     assert_refused(cli(*words, tmp_path / "run"), "There is a finished run", "risk.json", "--force")
+    assert_refused(cli("resume", tmp_path / "run"), "no unfinished run", "a finished one (risk.json)")
 
 
 def test_the_page_of_a_sum_names_its_parts_and_its_events(tmp_path: Path, brakings: str) -> None:
