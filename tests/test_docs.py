@@ -2,7 +2,8 @@
 
 What a ```python block prints stands in the ```text block that follows it; a block that prints nothing has none. One
 that begins with `# NAME.py` is saved under that name too. In a ```console block lines that begin with `$` are commands,
-each in a process of its own, and the lines below one are its output. All run in one new folder.
+each in a process of its own, and the lines below one are its output. All run in one new folder,
+the first pages in the same one, and a command that two of them show runs once.
 
 `...` stands for any text. Numbers with a decimal point or an exponent are compared to the digits shown, so a page shows
 as many as are the same on every machine. The rest is compared character by character, apart from the width of white
@@ -60,7 +61,7 @@ def run_command(command: str) -> str:
     environment = {**os.environ, "COLUMNS": "76", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     shortened = re.sub(r"--steps \S+", "--steps 2000", command)
     done = subprocess.run(["bash", "-c", shortened], env=environment, capture_output=True, text=True)
-    assert done.returncode in (0, 3), f"{command}{done.stdout}{done.stderr}"  # 3: done, with a warning
+    assert done.returncode in (0, 3), f"{command}\n{done.stdout}{done.stderr}"  # 3: done, with a warning
     return done.stdout
 
 
@@ -117,8 +118,14 @@ def _without_padding(text: str) -> str:
     return re.sub(r"(?<=[\[(])\s+|\s+(?=[\])])", "", text.strip())
 
 
-QUICK = ("README.md", "first_hour.md")
-"""Pages whose code runs by default."""
+QUICK = ("README.md", "first_hour.md", "meaning.md")
+"""The first pages, whose code runs by default."""
+
+
+@pytest.fixture(scope="module")
+def first_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+    """The folder of the first pages, and what commands have printed in it."""
+    return tmp_path_factory.mktemp("first"), {}
 
 
 @pytest.mark.parametrize(
@@ -126,10 +133,13 @@ QUICK = ("README.md", "first_hour.md")
     [pytest.param(page, id=page.name, marks=[] if page.name in QUICK else pytest.mark.slow) for page in PAGES],
 )
 @use_one_thread()
-def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_of_a_page(
+    page: Path, tmp_path: Path, first_folder: tuple[Path, dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     if page.name == "measures.md":
         pytest.importorskip("rtamt", reason="rtamt, for temporal logic, runs on Python 3.11 or older")
-    monkeypatch.chdir(tmp_path)
+    folder, said = first_folder if page.name in QUICK else (tmp_path, {})
+    monkeypatch.chdir(folder)
     code = blocks(page.read_text(encoding="utf-8"))
     assert code
     known = set(rare_envs.ENV_IDS)
@@ -137,7 +147,11 @@ def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     wrong = []
     for number, block in enumerate(each for each in code if not each.code.startswith(CHANGE_THE_MACHINE)):
         name = f"{page.name}, block {number}"
-        printed = run_command(block.code) if block.is_command else run_python(block.code, name, namespace)
+        if block.is_command:
+            command = block.code.partition("  #")[0].strip()
+            printed = said[command] if command in said else said.setdefault(command, run_command(command))
+        else:
+            printed = run_python(block.code, name, namespace)
         if not same_output(block, printed):
             wrong.append(f"{name}\n{block.code}prints\n{printed}where the page shows\n{block.output}")
     for env_id in set(rare_envs.ENV_IDS) - known:  # a page's own scenarios are not there for other tests
