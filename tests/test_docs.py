@@ -78,13 +78,13 @@ def run_python(code: str, name: str, namespace: dict[str, object]) -> str:
 def same_output(block: Block, printed: str) -> bool:
     """Return whether a block has printed what the page shows."""
     if block.is_command and ".zip" in block.code:
-        return first_words(block.output) == first_words(printed)
+        return same_text(first_words(block.output), first_words(printed))
     return same_text(block.output, printed)
 
 
-def first_words(text: str) -> list[str]:
+def first_words(text: str) -> str:
     """Return the first word of each line that does not continue another."""
-    return re.findall(r"^[^\s.]+", text, flags=re.MULTILINE)
+    return " ".join(re.findall(r"^\S+", text, flags=re.MULTILINE))
 
 
 def digit_place(number: str) -> float:
