@@ -48,7 +48,7 @@ def blocks(page: str) -> list[Block]:
             found.append(Block(code, after if kind == "text" else ""))
         elif language == "console":
             commands = re.findall(r"^\$ ((?:.*\\\n)*.*\n)((?:(?!\$ ).*\n)*)", code, flags=re.MULTILINE)
-            found += [Block(command, output, is_command=True) for command, output in commands]
+            found += [Block(command.partition("  #")[0].strip(), text, is_command=True) for command, text in commands]
     return found
 
 
@@ -148,12 +148,11 @@ def test_code_of_a_page(
     for number, block in enumerate(each for each in code if not each.code.startswith(CHANGE_THE_MACHINE)):
         name = f"{page.name}, block {number}"
         if block.is_command:
-            command = block.code.partition("  #")[0].strip()
-            printed = said[command] if command in said else said.setdefault(command, run_command(command))
+            printed = said[block.code] if block.code in said else said.setdefault(block.code, run_command(block.code))
         else:
             printed = run_python(block.code, name, namespace)
         if not same_output(block, printed):
-            wrong.append(f"{name}\n{block.code}prints\n{printed}where the page shows\n{block.output}")
+            wrong.append(f"{name}\n{block.code}\nprints\n{printed}where the page shows\n{block.output}")
     for env_id in set(rare_envs.ENV_IDS) - known:  # a page's own scenarios are not there for other tests
         del SCENARIOS[env_id]
         del gym.registry[env_id]
@@ -185,8 +184,10 @@ def headings(page: str) -> set[str]:
 
 def test_only_the_next_text_block_is_the_output() -> None:
     fences = [("python", "a"), ("text", "1"), ("python", "b"), ("python", "c"), ("", "d"), ("text", "2")]
+    fences += [("console", "$ e  # why\n3\n\n4\n$ f \\\n    g\n$ h"), ("text", "5")]
     page = "\n".join(f"```{language}\n{content}\n```\n" for language, content in fences)
-    assert blocks(page) == [("a\n", "1\n"), ("b\n", ""), ("c\n", "")]
+    python = [("a\n", "1\n", False), ("b\n", "", False), ("c\n", "", False)]
+    assert blocks(page) == [*python, ("e", "3\n\n4\n", True), ("f \\\n    g", "", True), ("h", "", True)]
 
 
 @pytest.mark.parametrize(
