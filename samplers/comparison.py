@@ -129,6 +129,12 @@ class Comparison(Kept):
         about: dict[str, Any] = {"includes_base": base is not None, "if_exact": if_exact, "quantity": "p_B / p_A"}
         return judge_ends(max_ratio, (low, high), self.confidence, reason, **about)
 
+    @property
+    def shares(self) -> dict[str, float]:
+        """P[both fail], P[only A], P[only B] and P[neither], which add up to 1."""
+        only_a, only_b = (max(0.0, side.p - self.both) for side in (self.a, self.b))
+        return {"both": self.both, "only_a": only_a, "only_b": only_b, "neither": 1.0 - self.both - only_a - only_b}
+
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw p of A, of B and of both with their intervals, p on a log scale; needs matplotlib.
 
@@ -188,12 +194,14 @@ class Comparison(Kept):
         lines += indent_lines(self.base_uncertainty)
         for name, side in (("A", self.a), ("B", self.b)):
             lines.append("  p_{} = {} ({} to {})".format(name, *format_alike(side.p, *side.interval)))
-        lines.append(f"  both fail: {format_alike(self.both)[0]}; {self.n_sim:,} simulations, half of them of each")
+        both, a, b = format_alike(*list(self.shares.values())[:3])
+        lines.append(f"  of all draws {both} fail both, {a} only A, {b} only B, {self.shares['neither']:.8g} neither")
+        lines.append(f"  {self.n_sim:,} simulations, half of them of each")
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; NaN and infinities become None."""
-        names = ("ratio", "interval", "confidence", "both", "n_sim", "warnings")
+        names = ("ratio", "interval", "confidence", "both", "shares", "n_sim", "warnings")
         data = {
             **{name: getattr(self, name) for name in names},
             "either": self.either.to_dict(),

@@ -60,6 +60,9 @@ def test_monte_carlo_with_hand_counted_hits():
 
     found = samplers.compare(picks([0, 1, 2, 3]), picks([0, 4]), "mc", seed=0, max_sim=200)
     assert (found.ratio, found.a.p, found.b.p, found.both) == pytest.approx((2.0, 0.04, 0.02, 0.01))
+    shares = {"both": 0.01, "only_a": 0.03, "only_b": 0.01, "neither": 0.95}
+    assert found.shares == found.to_dict()["shares"] == pytest.approx(shares)
+    assert "of all draws 0.010 fail both, 0.030 only A, 0.010 only B, 0.95 neither" in str(found)
     assert found.interval[0] < 1.0 < found.interval[1]
     assert "imprecise" in found.warnings[-1]
 
