@@ -36,7 +36,7 @@ from samplers.result import Estimate, without_base
 from samplers.run import Listener, RunArguments, check_problem
 from samplers.sample import Interval, bound_missed, degrees_of_freedom, effective_number
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["Comparison"]
 
 if TYPE_CHECKING:
     import pyarrow

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
-from samplers.bases import Gaussian, IndependentDistributions, as_distribution
+from samplers.bases import Gaussian, IndependentDistributions
 from samplers.components import expectation_maximisation, one_hot, posterior
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, needs_library
 from samplers.proposals import Mixture, move_gaussian
@@ -32,7 +32,6 @@ __all__ = [
     "NormalBlock",
     "Product",
     "StandardNormal",
-    "as_distribution",
 ]
 
 

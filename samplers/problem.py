@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from samplers.bases import LOG_TWO_PI, as_distribution
 
-__all__ = ["EvaluationError", "FunctionProblem", "Problem", "TermGradients", "Terms"]
+__all__ = ["TermGradients", "Terms"]
 
 SHARE_ROUNDING = 1e-6
 """Shares of strata add up to 1 within this."""

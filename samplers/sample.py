@@ -26,11 +26,7 @@ from samplers.problem import FloatArray
 
 __all__ = [
     "DrawWeights",
-    "Failures",
     "Layer",
-    "Level",
-    "Sample",
-    "Status",
     "binomial_cov",
     "bound_missed",
     "clopper_pearson",

@@ -1,7 +1,6 @@
 """Analyses of an estimate without new simulations: thresholds, base distributions, kinds of failure, sensitivities."""
 
 from samplers.analysis.base_error import BaseUncertainty, RefitBand
-from samplers.analysis.curve import Curve
 from samplers.analysis.expectation import (
     Exceedance,
     FailureExpectation,
@@ -9,7 +8,7 @@ from samplers.analysis.expectation import (
     expect_over_failures,
     expect_under_refits,
 )
-from samplers.analysis.gate import Pilot, PlannedRun, Verdict, plan
+from samplers.analysis.gate import Pilot, PlannedRun, Verdict
 from samplers.analysis.reweight import FittedBase, Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 from samplers.analysis.weighted import NO_OUTCOME_LABEL, Share, WeightedFailures, sum_by_label, weigh_failures
@@ -17,7 +16,6 @@ from samplers.analysis.weighted import NO_OUTCOME_LABEL, Share, WeightedFailures
 __all__ = [
     "NO_OUTCOME_LABEL",
     "BaseUncertainty",
-    "Curve",
     "Exceedance",
     "FailureExpectation",
     "FittedBase",
@@ -32,7 +30,6 @@ __all__ = [
     "compute_exceedance",
     "expect_over_failures",
     "expect_under_refits",
-    "plan",
     "sum_by_label",
     "weigh_failures",
 ]

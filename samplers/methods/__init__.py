@@ -30,7 +30,6 @@ from samplers.sample import Level, Sample, Status
 
 __all__ = [
     "METHODS",
-    "Auto",
     "Goal",
     "Interrupted",
     "Level",
