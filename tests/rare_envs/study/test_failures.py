@@ -16,7 +16,6 @@ from typer.testing import Result
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.egos.needs import RULE_BASED_EGOS
 from rare_envs.study import Question, Report, prepare, run, severity_curve
 from rare_envs.study.episodes import digest_scenarios
 from rare_envs.study.failures import (
@@ -183,15 +182,13 @@ def test_an_attentive_driver_does_again_what_it_did_and_avoids_what_a_coasting_e
     assert coasting["human"]["fails"] < 0.2 and coasting["idm"]["fails"] < 0.2
 
 
-def test_what_other_drivers_do_is_not_known_where_they_cannot_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rare_envs.study.failures.OTHER_DRIVERS", ("idm?", "human"))
-    monkeypatch.setitem(RULE_BASED_EGOS, "idm?", None)
+def test_what_other_drivers_do_is_not_known_where_they_cannot_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rare_envs.study.failures.OTHER_DRIVERS", ("nobody", "human"))
+    monkeypatch.setattr("rare_envs.study.failures.RULE_BASED_EGOS", ("nobody", "human"))
     question = Question(env_id=CUT_IN, ego="idm", method="mc", max_sim=1000, gamma=0.5)
     report = run(prepare(question))
     assert set(report.kinds.find_others()) == {"human"}
-    assert any(note.startswith("what idm? would do is not known: ") for note in report.notes)
+    assert any(note.startswith("what nobody would do is not known: ") for note in report.notes)
 
 
 def test_a_scenario_stands_once_in_the_list(report: Report) -> None:
