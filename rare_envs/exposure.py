@@ -255,7 +255,10 @@ class TotalRate:
 
     @cached_property
     def interval_per_million_km(self) -> RateInterval:
-        """Interval of `per_million_km`: of the sum of the determined rates, and above it the others' upper limits."""
+        """Interval of `per_million_km`: of the sum of the determined rates, and above it the others' upper limits.
+
+        No limit is below that of one of these rates: the sum is no less than it.
+        """
         if len(self.rates) == 1:
             return self.rates[0].interval_per_million_km
         rng = np.random.default_rng(0)
@@ -269,7 +272,8 @@ class TotalRate:
             groups.setdefault(key, rng.standard_normal(RATE_DRAWS))
             drawn += rate.draw(groups[key], rng)
         low, high = np.quantile(drawn, tail_levels(self.confidence))
-        return float(low), float(high) + above
+        ends = [rate.interval_per_million_km for rate in self.determined] or [(0.0, 0.0)]
+        return max(float(low), *(end[0] for end in ends)), max(float(high), *(end[1] for end in ends)) + above
 
     @property
     def determined(self) -> tuple[CollisionRate, ...]:

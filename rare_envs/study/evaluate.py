@@ -45,6 +45,7 @@ from rare_envs.study.arguments import (
     as_bad_input,
     find_method,
     output_folder,
+    read_question,
 )
 from rare_envs.study.ego_check.checks import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
@@ -58,9 +59,10 @@ from rare_envs.study.question import (
     note_question,
     open_question,
     prepare,
+    split_question,
 )
 from rare_envs.study.report import Repeatability, Report, find_frequency
-from rare_envs.study.run_folder import BLOCKS, FAILURES, RESULT_FILES, STUDY
+from rare_envs.study.run_folder import BLOCKS, COMPARISON, FAILURES, RESULT_FILES, STUDY
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
@@ -69,7 +71,6 @@ from samplers.workers import ExecutorError
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 8
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
-COMPARISON = "comparison.json"
 UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity", "max_p", "max_rate")
 """Fields of a question that a comparison does not use."""
 
@@ -526,6 +527,8 @@ def _compare(
         found = replace(found, warnings=(*found.warnings, *doubts))
         answer = _describe_comparison(found, studies)
         if out is not None:
+            for recorded in split_question(answer["question"]):
+                note_question(read_question(recorded))
             with writing.unwritten_results(out, (found, answer)):
                 replace_text(out / COMPARISON, format_json(answer) + "\n")
                 writing.write_failures(out, studies["A"].problem.space, found.either.failures)
@@ -537,11 +540,14 @@ def _describe_comparison(found: samplers.comparison.Comparison, studies: Mapping
     a, b = (study.question for study in studies.values())
     inputs = {key: value for key, value in asdict(a).items() if key not in UNUSED_FIELDS}
     verdict = None if a.max_ratio is None else found.meets(a.max_ratio, a.assume_traffic)
+    notes = [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes]
+    said = [f"A = {a.ego}, B = {b.ego}, {a.env_id}", *str(found).splitlines()]
     return {
         **found.to_dict(),
         "question": {"ego_a": inputs.pop("ego"), "ego_b": b.ego, **inputs, "algo_b": b.algo, "stats_b": b.stats},
         "gate": None if verdict is None else verdict.to_dict(),
-        "notes": [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes],
+        "notes": notes,
+        "text": [*said, *(f"  note: {note}" for note in notes)],
         "version": __version__,
     }
 

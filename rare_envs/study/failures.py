@@ -329,7 +329,7 @@ def _draw_by_weight(weights: FloatArray) -> NDArray[np.int64]:
     """Return `ROWS_DRIVEN` rows by their weights (n,), evenly spaced in the sum: heavy ones stand several times."""
     upto = np.cumsum(weights if weights.sum() > 0 else np.ones(len(weights)))
     places = (np.arange(ROWS_DRIVEN) + 0.5) / ROWS_DRIVEN * upto[-1]
-    return np.minimum(np.searchsorted(upto, places), len(weights) - 1)
+    return np.asarray(np.minimum(np.searchsorted(upto, places), len(weights) - 1), dtype=np.int64)
 
 
 def assign_modes(

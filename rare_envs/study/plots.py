@@ -333,7 +333,7 @@ def draw_speeds(axes: Axes, drive: Drive) -> None:
     for j, (name, role) in enumerate(zip(drive.names, drive.problem.world.scenario.vehicle_names, strict=True)):
         axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(role, j), label=name)
     axes.set(xlabel="time [s]", ylabel="speed [m/s]", ylim=(0, HEADROOM * max(1.0, float(drive.speed.max()))))
-    axes.legend(loc="upper center", ncols=3, fontsize=8, frameon=False)
+    axes.legend(loc="upper center", ncols=3, frameon=False)
 
 
 SHOWN_SECONDS = 5.0
@@ -356,6 +356,8 @@ def draw_measure(axes: Axes, drive: Drive) -> None:
     axes.axvline(drive.time[drive.worst], color=HIT_COLOUR, label="crash" if drive.collided else "closest")
     last = max(drive.problem.world.clock.dt, float(drive.time[-1]))
     axes.set(xlabel="time [s]", ylabel=SAID.get(name, name_measure(name)), xlim=(0.0, last))
+    if not np.isfinite(drive.f_alone[alive]).any() or float(np.min(drive.f_alone[alive], initial=np.inf)) > top:
+        axes.text(0.5, 0.5, f"more than {top:g} s up to the crash", ha="center", va="center", transform=axes.transAxes)
     if seconds:
         axes.set_ylim(float(np.nanmin(drive.f_alone[alive], initial=0.0)), top)
 

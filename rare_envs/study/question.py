@@ -309,6 +309,14 @@ def open_question(recorded: object, folder: Path, trust: bool, **given: Any) -> 
     return question
 
 
+def split_question(recorded: object) -> tuple[object, object]:
+    """Return the questions about A and about B of which a comparison was made."""
+    if not isinstance(recorded, dict):
+        return recorded, recorded
+    b = {"ego": recorded.get("ego_b"), "algo": recorded.get("algo_b"), "stats": recorded.get("stats_b")}
+    return {**recorded, "ego": recorded.get("ego_a")}, {**recorded, **b}
+
+
 def is_same_question(recorded: object, question: Question) -> bool:
     """Return whether a recorded question is this one, but for what a run that is resumed may change."""
     asked = _keep_asked(question)

@@ -31,7 +31,7 @@ from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
-from rare_envs.study.run_folder import JOURNAL
+from rare_envs.study.run_folder import JOURNAL, RISK
 from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
 from samplers.evaluate import Executor
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
@@ -39,8 +39,8 @@ from samplers.result import list_warnings
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
-RISK, PICTURE = "risk.json", "risk.png"
-"""Numbers of a risk, the last file that is written, and their picture."""
+PICTURE = "risk.png"
+"""Picture of the numbers of a risk, whose file is the last one that is written."""
 TWICE = ("cut_in", "car_following")
 """Scenarios of which a set may have one: a cut-in gives the ego a new leader, so that car-following behind new leaders
 contains the cut-ins."""
@@ -139,7 +139,7 @@ class ScenarioRisk:
             "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
-            "report": text.report_as_json(self.report),
+            "report": self.report.to_dict(),
         }
 
 

@@ -42,6 +42,8 @@ RESULT, FAILURES, BLOCKS = "result.json", "failures.csv", "failures.npz"
 EPISODES = "episodes.parquet"
 """All simulations."""
 REPORT = "report.html"
+RISK, COMPARISON = "risk.json", "comparison.json"
+"""What is in the folder of a risk, beside a run of each scenario, and in that of a comparison."""
 ANSWER, CRASH_STRIP, SCATTER = "answer.png", "crash.png", "failures.png"
 """The number; its most likely failure from above, and failures among ordinary traffic, if there are any."""
 SENSITIVITY, SEVERITY = "sensitivity.png", "severity.png"
@@ -57,6 +59,8 @@ CRASH = tuple(
     "injury_risk_striking injury_risk_struck".split()
 )
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
+MOST_NAMED = 4
+"""Files and folders that an error names."""
 MAX_TABLE_RATIO = 50
 """Largest ratio of the bytes of columns to those of their file, in which parameters take as many as they have."""
 MAX_TABLE_BYTES = 2**32
@@ -266,7 +270,8 @@ def load_study(folder: str | Path) -> LoadedStudy:
     path = Path(folder)
     if not all((path / name).is_file() for name in (RESULT, FAILURES)):
         raise BadInput(
-            f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
+            f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out "
+            f"writes, but {_say_what_is_there(path)}."
         )
     about = _read_object(path / STUDY) if (path / STUDY).exists() else {}
     if about.get("format") != STUDY_FORMAT and (path / STUDY).exists():
@@ -288,6 +293,23 @@ def load_study(folder: str | Path) -> LoadedStudy:
             stacklevel=2,
         )
     return study
+
+
+def _say_what_is_there(path: Path) -> str:
+    """Return what is in the place of a run, and which folder to give if there is one near."""
+    if not path.is_dir():
+        return f"{'it is a file' if path.exists() else 'there is no such folder'}"
+    runs = [str(each.parent) for each in sorted(path.glob(f"*/{RESULT}"))]
+    if (path.parent / RESULT).is_file():
+        runs.append(str(path.parent))
+    if runs:
+        return f"there is one in {', '.join(runs[:MOST_NAMED])}: give that folder"
+    if next(path.glob(f"*/{JOURNAL}"), None):
+        return "the command that writes into it was stopped: give the same command again"
+    names = sorted(each.name for each in path.iterdir())
+    return (
+        f"it has {', '.join(names[:MOST_NAMED])}{' and more' * (len(names) > MOST_NAMED)}" if names else "it is empty"
+    )
 
 
 def _read_object(path: Path) -> dict[str, Any]:

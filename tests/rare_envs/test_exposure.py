@@ -138,6 +138,13 @@ def test_a_scenario_that_is_not_determined_raises_the_upper_end_alone() -> None:
     assert {each.scenario for each in total.shares} <= {"cut_in", ""}
 
 
+@pytest.mark.parametrize("interval", [(1e-7, 1e-3), (1e-5, 1.2e-5)])
+def test_no_end_of_a_sum_is_below_that_of_a_rate_in_it(interval: tuple[float, float]) -> None:
+    parts = (rate(1.1e-5, 0.5, frequency(40, 10, 25), interval=interval), rate(1e-12, 0.1, scenario="b"))
+    ends = np.array([each.interval_per_million_km for each in parts])
+    assert (np.array(TotalRate(parts).interval_per_million_km) >= ends.max(axis=0)).all()
+
+
 def test_shares_of_the_variance_by_hand() -> None:
     """Weights 3 and 1: 9 (1.96 + .01) and 1 (.25 + .01), counts 9 / 100 + 1 / 100."""
     counted = frequency(100, 10.0, 25.0)

@@ -195,9 +195,9 @@ def check_ego_command(
 
 @command("trust")
 def report_command(
-    run: RunArgument,
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder of --out of estimate, risk or compare.")],
     asked: dict[str, Any],
-    out: Annotated[Path | None, Option(help="HTML file; by default report.html in RUN.")] = None,
+    out: Annotated[Path | None, Option(help="HTML file; by default report.html in FOLDER.")] = None,
     events: Annotated[
         Path | None,
         Option(help="CSV file of recorded events, with columns named as the parameters, to compare the crashes with."),
@@ -205,11 +205,11 @@ def report_command(
     figures: Annotated[str | None, Option(help="Format of figures as files too: svg, pdf or png.")] = None,
     force: ForceOption = False,
 ) -> Answer:
-    """Write the report of a run as one HTML file, with its failures by mode, driven again and filmed."""
+    """Write the report of a run, a risk or a comparison as one HTML file, with films of its failures."""
     from rare_envs.study.html_report import write_html_report
 
     refuse_existing(force, out, out and out.parent / "figures" if figures else None)
-    page, *drawn = write_html_report(run, events=events, out=out, figures=figures, **asked)
+    page, *drawn = write_html_report(folder, events=events, out=out, figures=figures, **asked)
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
     return Answer({"report": str(page), "figures": [str(path) for path in drawn]}, text)
 

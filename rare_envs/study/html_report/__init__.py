@@ -1,4 +1,4 @@
-"""Page: the report of a run, from its folder to one HTML file."""
+"""Page: the report of a run, a risk or a comparison, from its folder to one HTML file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from PIL import Image
 from scipy.spatial import KDTree
 
-from rare_envs.envs.rendering import CRASH_COLOUR, FRAME_WIDTH, ROLE_COLOURS
-from rare_envs.files import replace_text
+from rare_envs.envs.rendering import CRASH_COLOUR, ROLE_COLOURS
+from rare_envs.files import parse_json_object, read_text_file, replace_text
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import plots, text
@@ -28,9 +27,19 @@ from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
 from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.html_report import figures as drawings
 from rare_envs.study.html_report.figures import FigureOfPage
-from rare_envs.study.question import open_run, prepare, warn_of_changed_files
+from rare_envs.study.question import open_question, open_run, prepare, split_question, warn_of_changed_files
 from rare_envs.study.replay import Drive, describe_contact, drive_again, read_row
-from rare_envs.study.run_folder import EPISODES, REPORT, RESULT, STUDY, LoadedStudy, load_finished
+from rare_envs.study.run_folder import (
+    COMPARISON,
+    EPISODES,
+    REPORT,
+    RESULT,
+    RISK,
+    STUDY,
+    LoadedStudy,
+    load_finished,
+    read_failures,
+)
 from samplers.output import unfold_rows
 from samplers.problem import FloatArray
 from samplers.sample import describe_outcome
@@ -76,24 +85,20 @@ def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) 
     return NearestEvent(float(distance / root), float(np.mean(usual >= distance)), events[nearest])
 
 
-MOST_MODES = 8
-"""Modes that are shown with pictures; the others have a row in the table."""
-CLIP_WIDTH, CLIP_SECONDS = 560, 3.0
-"""Width of a clip [pixels], and seconds that it shows, the last ones up to the end of the drive."""
+MOST_MODES, LEAST_SHOWN = 8, 0.01
+"""Modes of a run that are shown with pictures, and the share that these have; the others have a line each."""
+MOST_COMPARED = 1000
+"""Failures of a comparison that both egos drive again, the most likely ones."""
+ROUNDING = 1e-9
+"""Largest difference of two sums of weights, as a share of them, that is rounding."""
+CLIP_SECONDS = 3.0
+"""Seconds that a clip shows, the last ones up to the end of the drive."""
 
 
-class AtlasEntry(NamedTuple):
-    """A mode of failure as the page shows it."""
+class Shown(NamedTuple):
+    """A scenario driven again, as the page shows it."""
 
-    mode: Mapping[str, Any]
-    """What result.json holds of it."""
-    f: float = np.nan
-    x: FloatArray | None = None
-    """The parameters that are shown of its most likely failure, shape (k,)."""
-    nearest: NearestEvent | None = None
-    """The recorded event that is nearest to it, if there are recordings."""
     drive: Drive | None = None
-    """That failure driven again."""
     clip: str = ""
     """Moving picture as a data URI; "" if there is none."""
     figures: Sequence[FigureOfPage] = ()
@@ -101,36 +106,79 @@ class AtlasEntry(NamedTuple):
     """Why there are no pictures; "" if there are."""
 
 
+class AtlasEntry(NamedTuple):
+    """A mode of failure as the page shows it."""
+
+    mode: Mapping[str, Any]
+    """What result.json holds of it."""
+    others: Mapping[str, str]
+    """What other drivers do in its scenarios, in words."""
+    f: float = np.nan
+    x: FloatArray | None = None
+    """The parameters that are shown of its most likely failure, shape (k,)."""
+    nearest: NearestEvent | None = None
+    """The recorded event that is nearest to it, if there are recordings."""
+    shown: Shown | None = None
+    """That failure; None where the mode is small and has a line alone."""
+
+
 def draw_shown(problem: DrivingProblem) -> FloatArray:
     """Return ordinary scenarios, the columns that are shown, shape (n, k)."""
     return draw_ordinary(problem.space)[:, [column.shown for column in list_columns(problem.space)]]
 
 
-def build_atlas(study: LoadedStudy, problem: DrivingProblem, events: FloatArray | None) -> list[AtlasEntry]:
-    """Return the entries of the largest modes; `events` (m, k) are recorded ones, if there are any."""
-    modes = list(study.result.get("modes") or [])[:MOST_MODES]
-    return [_build_entry(study, problem, events, number, mode) for number, mode in enumerate(modes, 1)]
+def build_atlas(
+    study: LoadedStudy, problem: DrivingProblem, events: FloatArray | None, prefix: str = "", share: float = 1.0
+) -> list[AtlasEntry]:
+    """Return the entries of all modes, the large ones with pictures.
+
+    Args:
+        study: The run.
+        problem: What it is about.
+        events: Recorded ones (m, k), if there are any.
+        prefix: Of the names of figures.
+        share: The run's share of what the page is about.
+    """
+    modes, found = list(study.result.get("modes") or []), list[AtlasEntry]()
+    for number, mode in enumerate(modes):
+        failure, others = mode.get("failure"), {name: _say_other(study, mode, name) for name in _list_others(study)}
+        entry = AtlasEntry(mode, others)
+        large = share * mode["of_failures"] >= LEAST_SHOWN or (number == 0 and share == 1.0)
+        if failure is None and large:
+            entry = entry._replace(shown=Shown(missing="none of its failures is in failures.csv"))
+        elif failure is not None and large and number < MOST_MODES:
+            whole = read_row(study.failures, problem, int(failure))
+            x = whole[[column.shown for column in list_columns(problem.space)]]
+            nearest = None if events is None else find_nearest_event(x, events, draw_shown(problem))
+            shown = _show_drive(problem, whole, f"{prefix}mode{number + 1}")
+            entry = entry._replace(f=float(study.failures["f"][int(failure)]), x=x, nearest=nearest, shown=shown)
+        found.append(entry)
+    return found
 
 
-def _build_entry(
-    study: LoadedStudy, problem: DrivingProblem, events: FloatArray | None, number: int, mode: Mapping[str, Any]
-) -> AtlasEntry:
-    failure = mode.get("failure")
-    if failure is None:
-        return AtlasEntry(mode, missing="none of its failures is in failures.csv")
-    whole = read_row(study.failures, problem, int(failure))
-    x = whole[[column.shown for column in list_columns(problem.space)]]
-    nearest = None if events is None else find_nearest_event(x, events, draw_shown(problem))
-    entry = AtlasEntry(mode, float(study.failures["f"][int(failure)]), x, nearest)
+def _list_others(study: LoadedStudy) -> list[str]:
+    """Return the names of other drivers that were put in the ego's place."""
+    return [name for name in study.result.get("other_drivers") or {} if name != study.question.get("ego")]
+
+
+def _say_other(study: LoadedStudy, mode: Mapping[str, Any], name: str) -> str:
+    """Return what another driver does in the scenarios of a mode, and in its most likely failure."""
+    each, failure = mode["other_drivers"][name], mode.get("failure")
+    f = np.nan if failure is None else float(study.failures[f"f_{name}"][int(failure)])
+    here = "" if np.isnan(f) else f", {'but not' if f <= study.result['gamma'] else 'also'} the most likely one"
+    return f"avoids {text.format_share(1 - each['fails'])} of {each['n']:,} such scenarios{here}"
+
+
+def _show_drive(problem: DrivingProblem, x: FloatArray, name: str) -> Shown:
+    """Return a scenario driven again with its pictures, or why there are none."""
     try:
-        drive = drive_again(problem, whole)
-        figures, clip = _draw_drive(drive, number), encode_clip(drive)
+        drive = drive_again(problem, x)
+        return Shown(drive, encode_clip(drive), _draw_drive(drive, name))
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
-        return entry._replace(missing=f"it cannot be shown: {reason_of(error)}")
-    return entry._replace(drive=drive, clip=clip, figures=figures)
+        return Shown(missing=f"it cannot be shown: {reason_of(error)}")
 
 
-def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
+def _draw_drive(drive: Drive, name: str) -> list[FigureOfPage]:
     """Return the figures of a drive: from above, the measure, and speeds."""
 
     def draw_views(figure: Figure) -> None:
@@ -140,37 +188,35 @@ def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
     def draw_measure(figure: Figure) -> None:
         axes = figure.subplots()
         plots.draw_measure(axes, drive)
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(frameon=False)
 
     def draw_speeds(figure: Figure) -> None:
         plots.draw_speeds(figure.subplots(), drive)
 
-    height = 0.25 + plots.MOMENTS * max(0.6, 0.045 * drive.road.lanes * drive.road.width)
+    height = 0.25 + plots.MOMENTS * max(0.45, 0.03 * drive.road.lanes * drive.road.width)
     return [
-        FigureOfPage(f"mode{number}-views", "From above; the ego is green", draw_views, (6.4, height)),
-        FigureOfPage(f"mode{number}-measure", "The measure over time", draw_measure, (6.4, 2.2)),
-        FigureOfPage(f"mode{number}-speeds", "Speeds over time", draw_speeds, (6.4, 2.8)),
+        FigureOfPage(f"{name}-views", "From above; the ego is green", draw_views, (4.2, height)),
+        FigureOfPage(f"{name}-measure", "The measure over time", draw_measure, (4.2, 2.2)),
+        FigureOfPage(f"{name}-speeds", "Speeds over time", draw_speeds, (4.2, 2.6)),
     ]
 
 
 def encode_clip(drive: Drive) -> str:
     """Return the last seconds of a drive as a data URI."""
     dt, buffer = drive.problem.world.clock.dt, io.BytesIO()
-    frames = plots.draw_frames(drive)[-max(round(CLIP_SECONDS / dt), 2) :]
-    size = (CLIP_WIDTH, round(frames[0].height * CLIP_WIDTH / FRAME_WIDTH))
-    plots.save_gif(buffer, [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames], dt)
+    plots.save_gif(buffer, plots.draw_frames(drive)[-max(round(CLIP_SECONDS / dt), 2) :], dt)
     return f"data:image/gif;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def write_html_report(
     folder: Path, trust: bool = False, events: Path | None = None, out: Path | None = None, figures: str | None = None
 ) -> list[Path]:
-    """Write the report of a finished run.
+    """Write the report of a finished run, a risk or a comparison.
 
     Args:
-        folder: Of the run.
+        folder: Of `rare-envs estimate --out`, `rare-envs risk --out` or `rare-envs compare --out`.
         trust: Let the ego's file run code, and code that a run from elsewhere names: failures are driven again.
-        events: CSV file of recorded events with a column for each parameter; None without.
+        events: CSV file of recorded events with a column for each parameter, for a run; None without.
         out: The file; report.html in the folder by default.
         figures: "svg", "pdf" or "png" for the figures as files too, in a folder `figures` beside the page.
 
@@ -191,36 +237,27 @@ def write_html_report(
     """
     if figures is not None and figures not in drawings.FORMATS:
         raise BadInput(f"Expected --figures {', '.join(drawings.FORMATS)}, got {figures!r}.")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # files that changed, which the page names
-        study, page = load_finished(folder), out or folder / REPORT
+    page = out or folder / REPORT
+    name = next((name for name in (RISK, COMPARISON) if (folder / name).is_file()), RESULT)
+    if events is not None and name != RESULT:
+        raise BadInput(f"Expected --events with the folder of one scenario, not with that of {name}: {str(folder)!r}.")
+    study = _load(folder) if name == RESULT else None
     with output_folder(page.parent, page.name, folders=() if figures is None else ("figures",)):
-        question = open_run(study, trust)
-        warn_of_changed_files(question, folder)
-        problem = prepare(question).problem
-        shown = [column.name for column in list_columns(problem.space) if column.shown]
-        known = None if events is None else read_recorded_events(events, shown)
+        if study is not None:
+            content = _describe_run(study, trust, events)
+            content |= {"rows": [(each.mode["of_failures"], "", each) for each in content["atlas"]]}
+            content |= {"runs": {"": content}}
+        else:
+            content = (_describe_risk if name == RISK else _describe_comparison)(folder, trust)
         with _damage_as_bad_input(folder):
-            atlas, drawn = build_atlas(study, problem, known), _make_figures(study, problem)
-            content = render_page(study, problem, drawn, atlas)
+            written = clean_text(_environment().get_template(f"{Path(name).stem}.html.j2").render(content))
         with as_bad_input(OSError):
-            replace_text(page, content)
-            if figures is None:
-                return [page]
-            every = [*drawn.values(), *(figure for entry in atlas for figure in entry.figures)]
-            return [page, *(figure.save(page.parent / "figures", figures) for figure in every)]
+            replace_text(page, written)
+            return [page, *(each.save(page.parent / "figures", figures) for each in content["drawn"] if figures)]
 
 
-def render_page(
-    study: LoadedStudy, problem: DrivingProblem, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
-) -> str:
-    """Return the page as text; everything that files say is escaped."""
-    result, base = study.result, study.result.get("base_uncertainty")
-    with as_bad_input(OSError):
-        changed = study.changed_files
-    doubts = [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
-    own, noted = ([str(each) for name in names for each in result.get(name) or []] for names in (["doubts"], NOTED))
-    doubts += own
+def _environment() -> jinja2.Environment:
+    """Return what renders the templates; everything that files say is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rare_envs.study.html_report"),
         autoescape=True,
@@ -228,36 +265,136 @@ def render_page(
         lstrip_blocks=True,
         finalize=_keep_numbers_whole,
     )
-    page = environment.get_template("report.html.j2").render(
-        result=result,
-        question=result.get("question") or {},
-        base=base if isinstance(base, dict) else None,
-        about=study.about,
-        folder=str(study.folder),
-        quoted_folder=shlex.quote(str(study.folder)),
-        answer=unfold_rows(result["text"][1:]),
-        doubts=doubts,
-        remarks=[each for each in noted if each not in own],
-        end=describe_outcome(str(result.get("status")), own),
-        no_gain=text.explain_no_gain(float(result["p"]), all(part["resolved"] for part in result.get("parts") or [])),
-        nouns=text.EVENT_NOUNS,
-        parts=text.describe_parts,
-        share=text.format_share,
-        sized_by_budget=SIZED_BY_BUDGET,
-        figures={name: figure.to_svg() for name, figure in figures.items()},
-        passes_levels=any(level["gamma"] != result["gamma"] for level in result.get("trace") or []),
-        severity=plots.list_severity(result.get("severity")),
-        atlas=atlas,
-        columns=[column for column in list_columns(problem.space) if column.shown],
-        usual=find_ordinary_range(draw_shown(problem)),
-        describe_kind=text.describe_kind,
-        probability=text.format_probability,
-        contact=describe_contact,
-        value=format_value,
-        with_interval=text.format_with_interval,
-        roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
-    )
-    return clean_text(page)
+    environment.globals |= {
+        "nouns": text.EVENT_NOUNS,
+        "other_nouns": text.OTHER_NOUNS,
+        "parts": text.describe_parts,
+        "share": text.format_share,
+        "sized_by_budget": SIZED_BY_BUDGET,
+        "describe_kind": text.describe_kind,
+        "name_scenario": text.name_scenario,
+        "probability": text.format_probability,
+        "contact": describe_contact,
+        "value": format_value,
+        "with_interval": text.format_with_interval,
+        "roles": {**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
+    }
+    return environment
+
+
+def _load(folder: Path) -> LoadedStudy:
+    """Return a finished run."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # files that changed, which the page names
+        return load_finished(folder)
+
+
+def _describe_run(
+    study: LoadedStudy, trust: bool, events: Path | None = None, prefix: str = "", share: float = 1.0
+) -> dict[str, Any]:
+    """Return what the page says of a run; `prefix` and `share` as in `build_atlas`."""
+    folder, question, result = study.folder, open_run(study, trust), study.result
+    warn_of_changed_files(question, folder)
+    problem = prepare(question).problem
+    columns = [column for column in list_columns(problem.space) if column.shown]
+    known = None if events is None else read_recorded_events(events, [column.name for column in columns])
+    with as_bad_input(OSError):
+        changed = study.changed_files
+    with _damage_as_bad_input(folder):
+        atlas, figures = build_atlas(study, problem, known, prefix, share), _make_figures(study, problem, prefix)
+        own, noted = ([str(each) for name in names for each in result.get(name) or []] for names in (["doubts"], NOTED))
+        resolved = all(part["resolved"] for part in result.get("parts") or [])
+        base, edited = result.get("base_uncertainty"), f"not what the run wrote, by the digests in its {STUDY}: "
+        return {
+            "title": f"How often does {study.question['ego']} fail in {study.question['env_id']}?",
+            "prefix": prefix,
+            "result": result,
+            "base": base if isinstance(base, dict) else None,
+            "about": study.about,
+            "folder": str(folder),
+            "quoted_folder": shlex.quote(str(folder)),
+            "answer": unfold_rows(result["text"][1:]),
+            "meaning": text.explain_run(result, study.about),
+            "doubts": [*([edited + ", ".join(changed)] if changed else []), *own],
+            "remarks": [each for each in noted if each not in own],
+            "end": describe_outcome(str(result.get("status")), own),
+            "no_gain": text.explain_no_gain(float(result["p"]), resolved),
+            "figures": {name: figure.to_svg() for name, figure in figures.items()},
+            "drawn": [*figures.values(), *(each for entry in atlas if entry.shown for each in entry.shown.figures)],
+            "passes_levels": any(level["gamma"] != result["gamma"] for level in result.get("trace") or []),
+            "severity": plots.list_severity(result.get("severity")),
+            "atlas": atlas,
+            "columns": columns,
+            "usual": find_ordinary_range(draw_shown(problem)),
+        }
+
+
+def _describe_risk(folder: Path, trust: bool) -> dict[str, Any]:
+    """Return what the page says of a risk: its sum, and all that it says of each scenario."""
+    with as_bad_input(OSError, ValueError), _damage_as_bad_input(folder):
+        total = parse_json_object(read_text_file(folder / RISK), RISK)
+        rates = {name: float(each["per_million_km"]) for name, each in total["scenarios"].items()}
+        whole, lines = sum(rates.values()), [str(line) for line in total["text"]]
+        last = max(k for k, line in enumerate(lines) if line.startswith("all "))
+    runs = {
+        name: _describe_run(_load(folder / name), trust, None, f"{name}-", rate / whole if whole else 1.0)
+        for name, rate in rates.items()
+    }
+    with _damage_as_bad_input(folder):
+        modes = [
+            (rates[name] / whole * entry.mode["of_failures"], name, entry)
+            for name, run in runs.items()
+            for entry in run["atlas"]
+        ]
+        return {
+            "title": f"How often does {total['ego']} crash?",
+            "result": total,
+            "headline": " ".join(lines[:1] if "per km" in lines[1] else lines[:2]),
+            "answer": unfold_rows(lines[last + 1 :]),
+            "meaning": text.explain_risk(total),
+            "doubts": [str(each) for each in total["warnings"]],
+            "runs": runs,
+            "limits": {name: dict(run["answer"]).get("Limited by", "") for name, run in runs.items()},
+            "modes": sorted(modes, key=lambda each: -each[0]),
+            "drawn": [each for run in runs.values() for each in run["drawn"]],
+        }
+
+
+def _describe_comparison(folder: Path, trust: bool) -> dict[str, Any]:
+    """Return what the page says of a comparison: its ratio, and the most likely failures as both egos drive them."""
+    with as_bad_input(OSError, ValueError):
+        found = parse_json_object(read_text_file(folder / COMPARISON), COMPARISON)
+        table = read_failures(folder)
+    questions = [open_question(each, folder, trust) for each in split_question(found.get("question"))]
+    problems = [prepare(question).problem for question in questions]
+    with _damage_as_bad_input(folder):
+        gamma, p, shown = float(found["either"]["gamma"]), float(found["either"]["p"]), list[Any]()
+        x = np.array([read_row(table, problems[0], k) for k in range(min(len(table["f"]), MOST_COMPARED))])
+        fails = [problem.evaluate(x) <= gamma if len(x) else np.empty(0, dtype=bool) for problem in problems]
+        columns, alone = list_columns(problems[0].space), [found[name]["p"] - found["both"] for name in "ab"]
+        outcomes = {
+            "Both fail": (fails[0] & fails[1], found["both"]),
+            "Only A fails": (fails[0] & ~fails[1], alone[0] if alone[0] > ROUNDING * p else 0.0),
+            "Only B fails": (fails[1] & ~fails[0], alone[1] if alone[1] > ROUNDING * p else 0.0),
+        }
+        for said, (rows, _) in outcomes.items():
+            for k in np.flatnonzero(rows)[:1]:
+                drives = [
+                    _show_drive(problem, x[k], f"failure{k}-{ego}") for problem, ego in zip(problems, "AB", strict=True)
+                ]
+                values = [(column, value) for column, value in zip(columns, x[k], strict=True) if column.shown]
+                shown.append((said, int(rows.sum()), values, drives))
+        return {
+            "title": f"{questions[0].ego} (A) against {questions[1].ego} (B) in {questions[0].env_id}",
+            "result": found,
+            "answer": found["text"],
+            "meaning": text.explain_comparison(found),
+            "doubts": [str(each) for each in found["warnings"]],
+            "outcomes": {said: share for said, (_, share) in outcomes.items()} | {"Neither fails": 1 - p},
+            "shown": shown,
+            "n_listed": len(x),
+            "drawn": [each for *_, drives in shown for drive in drives for each in drive.figures],
+        }
 
 
 NOTED = ("warnings", "remarks", "notes")
@@ -271,20 +408,21 @@ def _keep_numbers_whole(value: object) -> object:
 
 @contextlib.contextmanager
 def _damage_as_bad_input(folder: Path) -> Iterator[None]:
-    """Raise what a result.json or study.json of somebody else's making leads to as a BadInput."""
+    """Raise what files of somebody else's making lead to as a BadInput."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, jinja2.TemplateError) as error:
-        raise BadInput(f"{RESULT} or {STUDY} in {str(folder)!r} is damaged: {one_line(error)}.") from error
+        files = " or ".join(name for name in (RESULT, STUDY, RISK, COMPARISON) if (folder / name).is_file())
+        raise BadInput(f"{files} in {str(folder)!r} is damaged: {one_line(error)}.") from error
 
 
-def _make_figures(study: LoadedStudy, problem: DrivingProblem) -> dict[str, FigureOfPage]:
+def _make_figures(study: LoadedStudy, problem: DrivingProblem, prefix: str) -> dict[str, FigureOfPage]:
     """Return the figures of the run by name."""
     columns, ordinary = [column for column in list_columns(problem.space) if column.shown], draw_shown(problem)
     failing, log_weights = _read_failing(study, [column.name for column in columns])
     weighted = ~np.isnan(log_weights)
     measure = text.name_measure(str(study.question.get("measure", "")))
-    figures = drawings.figures_of_result(study.result, measure)
+    figures = drawings.figures_of_result(study.result, measure, prefix)
     if len(failing) and columns:
         weights = np.ones(len(failing))
         if weighted.any():
@@ -292,7 +430,9 @@ def _make_figures(study: LoadedStudy, problem: DrivingProblem) -> dict[str, Figu
         shift = np.abs(np.average(failing, axis=0, weights=weights) - ordinary.mean(axis=0))
         order = np.argsort(-shift / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")[: drawings.MAX_HISTOGRAMS]
         labels = [columns[j].label for j in order]
-        figures["parameters"] = drawings.figure_of_parameters(ordinary[:, order], failing[:, order], weights, labels)
+        figures["parameters"] = drawings.figure_of_parameters(
+            ordinary[:, order], failing[:, order], weights, labels, prefix
+        )
     return figures
 
 

@@ -83,7 +83,7 @@ class FigureOfPage:
         return figure
 
 
-PANEL_SIZE = (5.4, 3.2)
+PANEL_SIZE = (4.4, 3.0)
 """Size of a figure of one panel [inch]."""
 MAX_HISTOGRAMS = 12
 """Parameters that are shown, those that failures shift most."""
@@ -105,7 +105,7 @@ def draw_band(
     axes.set(yscale="log", xlabel=words[0], ylabel=words[1])
     if gamma is not None:
         axes.axvline(gamma, color=HIT_COLOUR, linewidth=1, label="gamma")
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(frameon=False)
 
 
 def draw_parameters(
@@ -128,11 +128,11 @@ def draw_parameters(
         axes.set(xlabel=labels[j].replace("_", " "), yticks=[])
         axes.spines["left"].set_visible(False)
     lines, words = panels[0].get_legend_handles_labels()
-    figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False, fontsize=8)
+    figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False)
 
 
-def figures_of_result(result: Result, measure: str) -> dict[str, FigureOfPage]:
-    """Return the figures that the numbers of a run allow, by name."""
+def figures_of_result(result: Result, measure: str, prefix: str = "") -> dict[str, FigureOfPage]:
+    """Return the figures that the numbers of a run allow, by name; `prefix` stands before it in files and ids."""
     curve, severity = result.get("curve"), result.get("severity")
     drawn: dict[str, tuple[str, Draw]] = {
         "convergence": (
@@ -148,11 +148,11 @@ def figures_of_result(result: Result, measure: str) -> dict[str, FigureOfPage]:
     if isinstance(severity, dict) and severity["largest_delta_v"] > SEVERE:
         over, axes = severity["curve"], ("delta-v [m/s]", "P[collision with a larger delta-v]")
         drawn["severity"] = "Severity of the collisions", lambda figure: draw_band(figure, over, "delta_v", axes)
-    return {name: FigureOfPage(name, *about, PANEL_SIZE) for name, about in drawn.items()}
+    return {name: FigureOfPage(prefix + name, *about, PANEL_SIZE) for name, about in drawn.items()}
 
 
 def figure_of_parameters(
-    ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str]
+    ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str], prefix: str = ""
 ) -> FigureOfPage:
     """Return the figure of `draw_parameters`: three panels side by side, two on a narrow screen."""
 
@@ -161,4 +161,4 @@ def figure_of_parameters(
         return lambda f: draw_parameters(f, ordinary, failing, weights, labels, columns), (width, height)
 
     caption = "Parameters in ordinary traffic and among failures, the most shifted first"
-    return FigureOfPage("parameters", caption, *make(3, 8.0), make(2, 4.6))
+    return FigureOfPage(f"{prefix}parameters", caption, *make(3, 8.0), make(2, 4.4))

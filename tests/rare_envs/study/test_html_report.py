@@ -14,10 +14,15 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from rare_envs.study import BadInput, Question, prepare, run_into
+import rare_envs
+from rare_envs.study import BadInput, Question, html_report, prepare, run_into
 from rare_envs.study.html_report import find_nearest_event, read_recorded_events, write_html_report
 from rare_envs.study.html_report.figures import FigureOfPage
 from samplers.output import unfold_rows
+from tests.rare_envs.study.fitted_files import write_fitted
+from tests.rare_envs.study.refusals import assert_refused
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +33,9 @@ def folder(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return path
 
 
-SECTIONS = tuple("answer warnings kinds atlas curve parameters intervals convergence levels made".split())
+SECTIONS = tuple(
+    "answer warnings meaning atlas rates nearest kinds curve parameters intervals convergence levels made".split()
+)
 """Ids of the sections of the page, in their order."""
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
 
@@ -100,7 +107,7 @@ def test_warnings_come_first_and_text_of_files_is_escaped(
     (run / "result.json").write_text(json.dumps(result))
     text = write_html_report(run)[0].read_text(encoding="utf-8")
     assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is imprecise" in text
-    assert text.index("the estimate is imprecise") < text.index("Kinds of crash")
+    assert text.index("the estimate is imprecise") < text.index("How it crashes") < text.index("Kinds of crash")
     assert "&lt;b&gt;a note" in text
     assert "not what the run wrote, by the digests in its study.json: result.json" in text
 
@@ -127,6 +134,71 @@ def test_a_run_without_failures_has_a_page(tmp_path: Path, safe: str) -> None:
     text = write_html_report(tmp_path / "run")[0].read_text(encoding="utf-8")
     assert Page(text).wrong == [] and [name for name in ids_of(text) if name in SECTIONS] == list(SECTIONS)
     assert "none in 50 simulations" in text and "No failure was found." in text
+
+
+@pytest.mark.slow
+def test_a_risk_has_one_page_with_the_modes_of_all_scenarios(
+    tmp_path: Path, cli: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
+    monkeypatch.setattr(html_report, "encode_clip", lambda drive: "")
+    bases = {name: write_fitted(tmp_path / f"{name}.json", name) for name in ("hard_brake", "cut_in")}
+    rare_envs.risk("idm?max_deceleration=0.5", bases=bases, method="mc", max_sim=400, out=tmp_path / "run")
+    done = cli("report", tmp_path / "run")
+    assert done.exit_code == 0, done.stderr
+    text, total = ((tmp_path / "run" / name).read_text() for name in ("report.html", "risk.json"))
+    total = json.loads(total)
+    assert Page(text).wrong == [] and len(set(ids_of(text))) == len(ids_of(text))
+    assert f"{total['ego']}: collisions per million km " in text
+    assert '<a href="#hard_brake-method">hard brake</a>' in text
+    modes = [mode for each in total["scenarios"].values() for mode in each["report"]["modes"]]
+    assert len(modes) > 1 and text.count("<h3>Mode ") + text.count(" of <code>rare-envs replay") == len(modes)
+    shares = [float(share) for share in re.findall(r"([\d.e+]+)\s% of the rate", text)]
+    assert shares == sorted(shares, reverse=True) and 90 < sum(shares) < 100.1
+    assert_refused(cli("report", tmp_path / "run", "--events", tmp_path / "events.csv"), "one scenario", "risk.json")
+    assert_refused(cli("replay", tmp_path / "run"), f"there is one in {tmp_path / 'run' / 'cut_in'}, ")
+
+
+def test_a_comparison_has_a_page_with_what_each_ego_does(
+    tmp_path: Path, risky: str, cli: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
+    monkeypatch.setattr(html_report, "encode_clip", lambda drive: "data:image/gif;base64,")
+    out, worse = tmp_path / "pair", "idm?max_deceleration=1"
+    done = cli("compare", "idm", worse, FOLLOWING, "--base", risky, "--max-sim", 2000, "--out", out, "--method", "mc")
+    said = done.stdout.splitlines()[:-1]
+    (page,) = write_html_report(out)
+    text = unescape(page.read_text(encoding="utf-8")).replace("\xa0", " ")
+    assert Page(text).wrong == [] and "\n".join(said) in text
+    found, shares = json.loads((out / "comparison.json").read_text()), {}
+    for name, percent in re.findall(r'<td class="name">(.*? fails?)</td><td class="n">([\d.]+)', text):
+        shares[name] = float(percent) / 100
+    assert sum(shares.values()) == pytest.approx(1.0, rel=0.01)
+    assert shares["Both fail"] + shares["Only B fails"] == pytest.approx(found["b"]["p"], rel=0.05)
+    assert text.count('<img src="data:image/gif') == 2 * text.count("<article>") >= 4
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ((), "there is no such folder"),
+        (("runs/",), "it is empty"),
+        (("runs/notes.txt", "runs/b"), "it has b, notes.txt"),
+        (("runs",), "it is a file"),
+        (("runs/first/result.json",), "there is one in runs/first: give that folder"),
+        (("result.json", "runs/"), "there is one in .: give that folder"),
+        (("runs/cut_in/journal.bin",), "was stopped: give the same command again"),
+    ],
+)
+def test_what_is_there_instead_of_a_run_is_said(
+    here: Path, files: tuple[str, ...], said: str, cli: Callable[..., Result]
+) -> None:
+    for name in files:
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / name).mkdir() if name.endswith("/") else (here / name).touch()
+    before = sorted(here.rglob("*"))
+    assert_refused(cli("report", "runs"), "No finished run in 'runs': expected result.json and failures.csv", said)
+    assert sorted(here.rglob("*")) == before
 
 
 def test_the_nearest_event_is_the_nearest_in_deviations() -> None:

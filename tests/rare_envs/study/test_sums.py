@@ -101,7 +101,7 @@ def test_the_page_of_a_sum_names_its_parts_and_its_events(tmp_path: Path, brakin
         assert f">{100 * part['of_sum']:.0f}\xa0%</td>" in text
     assert "stops of the lead " in text and "slowings of the lead " in text
     assert "people in the same events 4.0 (2.2 to 6.9)" in text
-    assert text.count(f"human driver model: no calibration of {brakings}") == 2
+    assert text.count(f"<td>no calibration of {brakings}</td>") == 2
 
 
 def test_limits_are_compared_with_the_one_sided_ends_of_the_sum(brakings: str) -> None:
