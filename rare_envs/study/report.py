@@ -409,9 +409,7 @@ class Report:
         return found
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
-        """Return JSON-ready values: question, estimate, the `top` most likely failures, the answer as `text`."""
-        from rare_envs.study.text import WHOLE, describe_answer, list_gate  # they take reports
-
+        """Return JSON-ready values: question, estimate, the `top` most likely failures."""
         failures, space = self.estimate.failures, self.study.problem.space
         listed = itertools.islice(zip(failures, self.crashes, strict=True), top)
 
@@ -469,7 +467,6 @@ class Report:
                 {"base": name, **({"refused": found} if isinstance(found, str) else {"refused": "", **found.to_dict()})}
                 for name, found in self.other_bases.items()
             ],
-            "text": [*describe_answer(self, most=WHOLE), *list_gate(self.verdict)],
             "version": __version__,
         }
 

@@ -341,6 +341,11 @@ def describe_answer(report: Report, last: Sequence[Row] = (), most: int = MOST_L
     return [*head, *fold_rows([*rows, *list_warnings(report.warnings), *last], most - len(head))]
 
 
+def report_as_json(report: Report) -> dict[str, Any]:
+    """Return a report as values of JSON, with the whole answer as `text`."""
+    return {**report.to_dict(), "text": [*describe_answer(report, most=WHOLE), *list_gate(report.verdict)]}
+
+
 def name_p(question: Question) -> str:
     """Return what a question counts."""
     if not explain_other_events(question):

@@ -316,12 +316,12 @@ class Answer(NamedTuple):
 
 def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
     """Return the answer of a `Report`, of a run in a folder `out` or of none."""
-    from rare_envs.study.text import print_report
+    from rare_envs.study.text import print_report, report_as_json
 
     doubtful = DOUBTFUL if report.doubtful else 0
     show = functools.partial(print_report, report, out, details)
     code = doubtful if report.verdict is None else GATE_CODES[report.verdict.decision]
-    return Answer(report.to_dict(), show, code)
+    return Answer(report_as_json(report), show, code)
 
 
 def answering(work: Callable[[], Answer | None], as_json: bool, stopped: str, details: bool) -> None:
