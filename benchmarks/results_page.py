@@ -16,8 +16,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 HEAD = """\
 # Results
 
-`python -m benchmarks.results_page` writes this page from the records in `benchmarks/results`, each of which has the
-command that made it. To read one:
+What was measured, section by section: the question, the command that answers it, the figures. All are of November 2026
+and version 0.1.0. `python -m benchmarks.results_page` writes this page from the JSON records in `benchmarks/results`,
+which have more than it shows. To read one:
 
 ```python
 import json
@@ -25,23 +26,27 @@ from pathlib import Path
 
 import rare_envs
 
-results = Path(rare_envs.__file__).parents[1] / "benchmarks" / "results"  # of a clone of the repository
-record = json.loads((results / "truth.json").read_text())
+clone = Path(rare_envs.__file__).parents[1]  # of the repository
+record = json.loads((clone / "benchmarks/results/truth.json").read_text())
 for row in record["results"]:
-    print(f"{row['env_id']}, {row['base']}: p = {row['p']:.2e} by {row['rollouts']:,} rollouts")
+    name, million = row["env_id"].partition("/")[2], row["rollouts"] // 10**6
+    print(f"{name}, {row['base']}: {row['p']:.2e} by {million} million")
 ```
 
 ```text
-rare_envs/CarFollowing-v0, us101-gap: p = 1.22e-04 by 300,000,000 rollouts
-rare_envs/CarFollowing-v0, highway: p = 2.58e-04 by 300,000,000 rollouts
-rare_envs/CutIn-v0, us101-15-offsets: p = 7.82e-04 by 300,000,000 rollouts
-rare_envs/CutIn-v0, highway: p = 3.07e-04 by 300,000,000 rollouts
+CarFollowing-v0, us101-gap: 1.22e-04 by 300 million
+CarFollowing-v0, highway: 2.58e-04 by 300 million
+CutIn-v0, us101-15-offsets: 7.82e-04 by 300 million
+CutIn-v0, highway: 3.07e-04 by 300 million
 ```
 
-- *mean / p*: mean of the estimates over the seeds, relative to the exact or reference probability.
+These are collision probabilities of the rule-based ego by plain rollouts, the truth of the first section. Words of the
+tables:
+
+- *mean / p*: mean of the estimates over the seeds, divided by the true probability.
 - *coverage*: share of the runs whose 95 % interval covers p.
-- *c.o.v. (own)*: coefficient of variation over the seeds, and the one that the runs state.
-- *gain*: simulations that plain Monte Carlo needs for the same mean square error, over those of the method.
+- *c.o.v. (own)*: relative standard error over the seeds, and (the one that the runs state).
+- *gain*: how many times as many simulations plain Monte Carlo needs for the same mean square error.
 """
 SHOWN_PAPERS = ("tian2024", "okelly2018_full", "okelly2018_vision")
 SHOWN_STATES = 10
@@ -78,7 +83,8 @@ def name_of(env_id: str) -> str:
 def format_traffic() -> Iterator[str]:
     """Yield the section of methods in traffic."""
     record = read("against_truth")
-    yield f"## Methods in traffic\n\n`{record['command']}`, against the 300 million rollouts above.\n"
+    yield "## Methods in traffic\n\nDo the methods find the true probability of a collision, and at what cost?"
+    yield f"40 runs of each, against the 300 million rollouts above: `{record['command']}`.\n"
     heads = ("scenario, base", "method", "mean / p", "coverage", "c.o.v. (own)", "simulations", "gain")
     yield format_table(
         heads,
@@ -101,11 +107,12 @@ def format_traffic() -> Iterator[str]:
 def format_samplers() -> Iterator[str]:
     """Yield the section of methods where p is known, side by side."""
     record = read("samplers")
-    yield f"## Methods where p is known\n\n`{record['about']['command']}`. A run is *far* that is off by more than"
-    yield "4 of its own standard errors, *wrong* if far or its interval misses p; in brackets 95 % intervals.\n"
+    yield "## Methods where p is known\n\nDo they find exact probabilities of problems without cars, and warn if not?"
+    yield f"`{record['about']['command']}`. A run is *far* if it is off by more than"
+    yield "4 of its own standard errors, and *wrong* if far or if its interval misses p; 95 % intervals follow the shares.\n"
     (tables,) = record["tables"]
     yield format_table(*tables["methods"])
-    yield "\nGains (coverage in %) where the first covers or gains least, and where another gains **twice as much**:\n"
+    yield "\nGains (coverage in %) where the first covers or gains least, or another gains **twice as much**:\n"
     heads, rows = tables["problems"]
     yield format_table(heads, (row for k, row in enumerate(rows) if k < SHOWN_STATES or "**" in "".join(row)))
 
@@ -113,7 +120,9 @@ def format_samplers() -> Iterator[str]:
 def format_strata() -> Iterator[str]:
     """Yield the section of sums over strata."""
     record = read("strata")
-    yield f"## Sums over strata\n\n`{record['about']['command']}`: half-spaces in strata of very different size.\n"
+    yield "## Sums over strata\n\nWhat is gained by a run for each kind of event (`auto`)?"
+    yield "Half-spaces in strata of very different size:"
+    yield f"`{record['about']['command']}`.\n"
     for tables in record["tables"]:
         yield f"Gains (coverage in %) with {tables['budget']:,} simulations:\n"
         yield format_table(*tables["problems"])
@@ -129,9 +138,9 @@ def _format_cov(row: Mapping[str, Any]) -> str:
 def format_stopping() -> Iterator[str]:
     """Yield the section of runs that stop on what they see."""
     record = read("stopping")
-    yield f"## Runs to a target\n\n`{record['command']}`: coverage at the stop, and of the sequence"
-    yield "at all looks, without the share that a search may have missed. *Gate*: wrong passes at a limit just below p,"
-    yield "wrong failures just above, undecided at 0.8 p and 1.25 p (by the interval).\n"
+    yield "## Runs to a target\n\nDoes an interval still cover p if the run stops on what it saw?"
+    yield "Coverage at the stop, and of the sequence at all looks, without what a search may have missed. *Gate*: wrong passes at a limit just below p,"
+    yield f"wrong failures just above, undecided at 0.8 p and 1.25 p (by the interval). `{record['command']}`\n"
     yield format_table(
         ("problem", "p", "method, c.o.v.", "interval", "sequence", "at all looks", "times as wide", "gate"),
         (
@@ -156,10 +165,10 @@ def _read_gates(case: Mapping[str, Any]) -> tuple[list[float], list[float]]:
 def format_bases() -> Iterator[str]:
     """Yield the section of intervals from refits."""
     record = read("recipe_coverage")
-    yield f"## Intervals of the base distribution\n\n`{record['command']}`: worlds with known p, coordinates and"
-    yield "components chosen anew in each refit.\n"
+    yield "## Intervals of the base distribution\n\nDo the intervals from refits to few recorded events cover p?"
+    yield f"In worlds with known p; coordinates and components are chosen in each refit: `{record['command']}`.\n"
     yield format_table(
-        ("world", "draws", "covers p", "wholly below p", "not determined", "sampling interval covers p"),
+        ("world", "draws", "covers p", "wholly below p", "upper limit only", "sampling interval covers p"),
         (
             (
                 f"{world['name']}, {world['events']} events",
@@ -178,9 +187,9 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
         ids: Environments that there are.
     """
     record = read("egos")
-    yield f"## Egos\n\n`{record['command']}`: p of a collision within 10 s by the default method, `auto`, or by plain"
-    yield "draws, `mc`; `ppo` and `dqn` are trained in the scenario, as `train-ego` does. Where the base has strata, p"
-    yield "in each of them too, or its upper end where it is not resolved.\n"
+    yield "## Egos\n\nHow often do the shipped and some trained egos crash? p of a collision within 10 s,"
+    yield "and in each kind of event, by the default method, `auto`, or by plain draws, `mc`; intervals of simulation"
+    yield f"alone. `ppo` and `dqn` are trained in the scenario, as `train-ego` does: `{record['command']}`.\n"
     cells = [cell for cell in record["cells"] if cell["env_id"] in ids]
     yield format_table(
         ("scenario", "ego", "by", "p", "95 % interval", "strata", "warnings", "likeliest crash"),
@@ -205,8 +214,8 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
 
 def format_papers() -> Iterator[str]:
     """Yield the section of both papers: p and gains; the records have every row."""
-    yield "## Papers\n\nWhat the papers print beside what this package finds; every row and the reasons of differences"
-    yield "are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
+    yield "## Papers\n\nAre the tables of Tian et al. (2024) and O'Kelly et al. (2018) reproduced?"
+    yield "Every row and the reasons for differences are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
     for name in SHOWN_PAPERS:
         record = read(name)
         yield f"\n`{record['command']}`\n"
@@ -235,7 +244,8 @@ def _number(value: float) -> str:
 def format_speed() -> Iterator[str]:
     """Yield the section of speed."""
     record = read("throughput")
-    yield "## Speed\n\n`make bench`: rates over those of HighwayEnv's own objects in the same process"
+    yield "## Speed\n\nHow many times as fast as HighwayEnv's own objects is the simulation, in one process?"
+    yield "`make bench`"
     yield f"({record['machine']['processor']}, one core).\n"
     rows = [(key.replace("_", " "), row) for key, row in record["results"].items() if row.get("ratio")]
     yield format_table(
