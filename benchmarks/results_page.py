@@ -29,8 +29,8 @@ import rare_envs
 clone = Path(rare_envs.__file__).parents[1]  # of the repository
 record = json.loads((clone / "benchmarks/results/truth.json").read_text())
 for row in record["results"]:
-    name, million = row["env_id"].partition("/")[2], row["rollouts"] // 10**6
-    print(f"{name}, {row['base']}: {row['p']:.2e} by {million} million")
+    env, n = row["env_id"].partition("/")[2], row["rollouts"] // 10**6
+    print(f"{env}, {row['base']}: {row['p']:.2e} by {n} million")
 ```
 
 ```text
@@ -108,8 +108,8 @@ def format_samplers() -> Iterator[str]:
     """Yield the section of methods where p is known, side by side."""
     record = read("samplers")
     yield "## Methods where p is known\n\nDo they find exact probabilities of problems without cars, and warn if not?"
-    yield f"`{record['about']['command']}`. A run is *far* if it is off by more than"
-    yield "4 of its own standard errors, and *wrong* if far or if its interval misses p; 95 % intervals follow the shares.\n"
+    yield f"`{record['about']['command']}`. A run is *far* if it is off by more than 4 of its own standard errors,"
+    yield "and *wrong* if far or if its interval misses p; 95 % intervals follow the shares.\n"
     (tables,) = record["tables"]
     yield format_table(*tables["methods"])
     yield "\nGains (coverage in %) where the first covers or gains least, or another gains **twice as much**:\n"
@@ -139,7 +139,8 @@ def format_stopping() -> Iterator[str]:
     """Yield the section of runs that stop on what they see."""
     record = read("stopping")
     yield "## Runs to a target\n\nDoes an interval still cover p if the run stops on what it saw?"
-    yield "Coverage at the stop, and of the sequence at all looks, without what a search may have missed. *Gate*: wrong passes at a limit just below p,"
+    yield "Coverage at the stop, and of the sequence at all looks, without what a search may have missed."
+    yield "*Gate*: wrong passes at a limit just below p,"
     yield f"wrong failures just above, undecided at 0.8 p and 1.25 p (by the interval). `{record['command']}`\n"
     yield format_table(
         ("problem", "p", "method, c.o.v.", "interval", "sequence", "at all looks", "times as wide", "gate"),
@@ -215,7 +216,8 @@ def format_egos(ids: frozenset[str]) -> Iterator[str]:
 def format_papers() -> Iterator[str]:
     """Yield the section of both papers: p and gains; the records have every row."""
     yield "## Papers\n\nAre the tables of Tian et al. (2024) and O'Kelly et al. (2018) reproduced?"
-    yield "Every row and the reasons for differences are in the records, and in `reproduction.md` of `python -m benchmarks.papers`.\n"
+    yield "Every row and the reasons for differences are in the records, and in `reproduction.md` of"
+    yield "`python -m benchmarks.papers`.\n"
     for name in SHOWN_PAPERS:
         record = read(name)
         yield f"\n`{record['command']}`\n"
