@@ -31,7 +31,7 @@ from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, list_co
 from rare_envs.study.export import export_drive
 from rare_envs.study.question import Study, open_run, prepare
 from rare_envs.study.replay import REPLAY_TOLERANCE, Drive, drive_again, read_row
-from rare_envs.study.run_folder import RESULT, LoadedStudy, load_finished
+from rare_envs.study.run_folder import RESULT, RISK, LoadedStudy, load_finished
 from rare_envs.study.text import describe_kind, format_probability, format_rate
 from samplers.output import to_json_value
 
@@ -132,18 +132,26 @@ def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> Status:
 
 
 def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
-    """Write the evidence of a finished run into its folder.
+    """Write the evidence of a finished run, or of each run of a risk, into its folder.
 
     Args:
-        folder: Of `rare-envs estimate --out`.
+        folder: Of `rare-envs estimate --out` or `rare-envs risk --out`.
         trust: Whether code that a folder from elsewhere names may run.
 
     Returns:
-        The files written, the page first. What was there of an earlier call is replaced.
+        The files written, the page of each run before its others. Those of an earlier call are replaced.
 
     Raises:
         BadInput: There is no finished run, it may not be driven again, or a file cannot be written.
     """
+    if (folder / RISK).is_file():
+        runs = sorted(path.parent for path in folder.glob(f"*/{RESULT}"))
+        return tuple(path for run in runs for path in _write_evidence_of_run(run, trust))
+    return _write_evidence_of_run(folder, trust)
+
+
+def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Path, ...]:
+    """Write the evidence of one run and return its files."""
     study = load_finished(folder)
     prepared = prepare(open_run(study, trust))
     out = folder / EVIDENCE

@@ -203,15 +203,25 @@ def report_command(
         Option(help="CSV file of recorded events, with columns named as the parameters, to compare the crashes with."),
     ] = None,
     figures: Annotated[str | None, Option(help="Format of figures as files too: svg, pdf or png.")] = None,
+    evidence: Annotated[
+        bool,
+        Option(
+            "--evidence",
+            help="Write files for a safety case too: coverage, uncertainty, checks, test cases and a claim tree.",
+        ),
+    ] = False,
     force: ForceOption = False,
 ) -> Answer:
     """Write the report of a run, a risk or a comparison as one HTML file, with films of its failures."""
+    from rare_envs.study.evidence import write_evidence
     from rare_envs.study.html_report import write_html_report
 
     refuse_existing(force, out, out and out.parent / "figures" if figures else None)
     page, *drawn = write_html_report(folder, events=events, out=out, figures=figures, **asked)
+    filed = [str(path) for path in (write_evidence(folder, **asked) if evidence else ())]
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
-    return Answer({"report": str(page), "figures": [str(path) for path in drawn]}, text)
+    text += "".join(f"\nWrote {path} and the files beside it." for path in filed if path.endswith(".html"))
+    return Answer({"report": str(page), "figures": [str(path) for path in drawn], "evidence": filed}, text)
 
 
 @command("trust")

@@ -2,11 +2,13 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import jsonschema
 import pytest
+from typer.testing import Result
 
 from rare_envs.study import Question, prepare, run_into
 from rare_envs.study.evidence import CELLS, EVIDENCE, FILES, SCHEMA, judge_leaf, write_evidence
@@ -99,3 +101,12 @@ def test_a_run_without_failures_supports_no_claim_about_them(tmp_path: Path) -> 
 def test_the_page_says_what_it_is_not(run: Path) -> None:
     page = (run / EVIDENCE / "evidence.html").read_text(encoding="utf-8")
     assert "no conformity assessment" in page and "<svg" in page and "us101" in page
+
+
+def test_a_report_files_the_evidence_of_each_run_of_a_risk(tmp_path: Path, cli: Callable[..., Result]) -> None:
+    folder = tmp_path / "risk"
+    cli("risk", "idm", "--max-sim", 500, "--out", folder)
+    answer = cli("report", folder, "--evidence", "--json")
+    assert answer.exit_code == 0, answer.output
+    pages = [Path(path) for path in json.loads(answer.stdout)["evidence"] if path.endswith(".html")]
+    assert [page.parent.parent.name for page in pages] == ["cut_in", "hard_brake"]
