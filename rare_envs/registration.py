@@ -93,22 +93,11 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
     return DrivingParallelEnv(env_id, **{**layout, **kwargs})
 
 
-def raw_env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
+def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Return PettingZoo's AEC environment of an id: `parallel_env` with one agent acting after the other.
 
-    Its arguments are those of `parallel_env`, and so are its errors.
-
-    Example:
-        >>> raw_env("rare_envs/CutIn-v0").possible_agents
-        ['ego', 'cutter', 'lead']
-    """
-    from pettingzoo.utils.conversions import parallel_to_aec_wrapper
-
-    return parallel_to_aec_wrapper(parallel_env(env_id, **kwargs))
-
-
-def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
-    """Return `raw_env` behind PettingZoo's usual wrapper, which refuses calls in a wrong order.
+    Its arguments are those of `parallel_env`, and so are its errors. PettingZoo's usual wrapper refuses calls in a
+    wrong order.
 
     Example:
         >>> import rare_envs
@@ -118,8 +107,9 @@ def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
         ('ego', (3, 4))
     """
     from pettingzoo.utils import OrderEnforcingWrapper
+    from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-    return OrderEnforcingWrapper(raw_env(env_id, **kwargs))
+    return OrderEnforcingWrapper(parallel_to_aec_wrapper(parallel_env(env_id, **kwargs)))
 
 
 def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:

@@ -56,15 +56,19 @@ __all__ = [
     "estimate",
     "plan",
 ]
-_ON_USE = ("limit_states", "strata", "testing")
-"""Public modules that nothing above imports."""
+_MODULES = (
+    *("analysis", "comparison", "distributions", "executors", "limit_states", "methods"),
+    *("problem", "proposals", "run", "sample", "strata", "testing"),
+)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public module on first use."""
-    if name not in _ON_USE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return importlib.import_module(f"{__name__}.{name}")
+    """Import a public module on first use; say where a name is that one of them has."""
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
+    places = [] if name.startswith("_") else [importlib.import_module(f"{__name__}.{each}") for each in _MODULES]
+    hint = next((f"; it is {place.__name__}.{name}" for place in places if name in place.__all__), "")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
 
 
 def __dir__() -> list[str]:

@@ -32,16 +32,9 @@ PARAMETERS = {
     HIGHWAY: ("s", "t", "heading", "speed", "weights", "noise"),
 }
 METHODS = {
-    "auto": "Auto",
-    "mc": "MonteCarlo",
-    "is": "ImportanceSampling",
-    "ce": "CrossEntropy",
-    "ice": "ImprovedCrossEntropy",
-    "ss": "SubsetSimulation",
-    "adss": "AdaptiveSubsetSimulation",
-    "two-stage": "TwoStage",
-    "series": "Series",
-    "surrogate": "Surrogate",
+    **{"auto": "Auto", "mc": "MonteCarlo", "is": "ImportanceSampling", "ce": "CrossEntropy", "series": "Series"},
+    **{"ice": "ImprovedCrossEntropy", "ss": "SubsetSimulation", "adss": "AdaptiveSubsetSimulation"},
+    **{"two-stage": "TwoStage", "surrogate": "Surrogate"},
 }
 COMMANDS = {
     "list": "--json",
@@ -199,6 +192,13 @@ def test_a_package_shows_the_names_of_most_users(package: ModuleType, n: int) ->
     page = (Path(__file__).parents[1] / "docs/reference/index.md").read_text().split(f"::: {package.__name__}\n")[1]
     listed = re.findall(r"^        - (\w+)$", page.partition(":::")[0], re.MULTILINE)
     assert sorted(listed) == (dir(package) if n > 10 else [])  # in the order of use where they are many
+
+
+def test_a_name_of_a_module_is_said_to_be_there() -> None:
+    with pytest.raises(AttributeError, match=r"'StandardNormal'; it is samplers\.distributions\.StandardNormal$"):
+        _ = samplers.StandardNormal
+    with pytest.raises(AttributeError, match=r"has no attribute 'plan_runs'$"):
+        _ = samplers.plan_runs
 
 
 def test_methods_have_names_and_defaults() -> None:

@@ -37,16 +37,7 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import __version__
 from rare_envs.study import arguments, writing
-from rare_envs.study.arguments import (
-    BadInput,
-    Question,
-    RunInterrupted,
-    UnwrittenResults,
-    as_bad_input,
-    find_method,
-    output_folder,
-    read_question,
-)
+from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
 from rare_envs.study.ego_check.checks import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures, drive_by_others
@@ -528,7 +519,7 @@ def _compare(
         answer = _describe_comparison(found, studies)
         if out is not None:
             for recorded in split_question(answer["question"]):
-                note_question(read_question(recorded))
+                note_question(arguments.read_question(recorded))
             with writing.unwritten_results(out, (found, answer)):
                 replace_text(out / COMPARISON, format_json(answer) + "\n")
                 writing.write_failures(out, studies["A"].problem.space, found.either.failures)
@@ -560,7 +551,7 @@ def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[sa
         name = asked["method"]
     p, cov, n_sim, seconds = (_read_number(recorded, each) for each in ("p", "cov", "n_sim", "seconds"))
     with as_bad_input(ValueError):
-        method = find_method(name if isinstance(name, str) else reprlib.repr(name))
+        method = arguments.find_method(name if isinstance(name, str) else reprlib.repr(name))
         final = None if recorded.get("final_draws") is None else int(_read_number(recorded, "final_draws"))
         if final is not None and final > n_sim:
             raise ValueError(f"The result says {final} final draws of {n_sim:g} simulations.")
@@ -577,7 +568,7 @@ def plan_by_pilots(
     """Run a pilot by each method, and return what each needs; plain Monte Carlo last."""
     found: dict[str, samplers.analysis.PlannedRun] = {}
     with as_bad_input(ValueError):
-        chosen = {name: find_method(name) for name in methods}  # before a pilot, which may take hours
+        chosen = {name: arguments.find_method(name) for name in methods}  # before a pilot, which may take hours
     study = prepare(replace(question, method=methods[0], ensemble_run=False))
     for name, method in chosen.items():
         with as_bad_input(ValueError):

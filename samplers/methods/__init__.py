@@ -207,12 +207,9 @@ def get_method(name: str, **settings: Any) -> Stepping:
         >>> samplers.methods.get_method("samplers.methods.cross_entropy:CrossEntropy", n_final=500).n_final
         500
     """
-    if isinstance(name, str) and ":" in name:
-        found = _import_method(name)
-    else:
-        if not isinstance(name, str) or name not in METHODS:
-            check_name("method", name, [*METHODS, "module:Class"])
-        found = METHODS[name]
+    if not isinstance(name, str) or (":" not in name and name not in METHODS):
+        check_name("method", name, [*METHODS, "module:Class"])
+    found = _import_method(name) if ":" in name else METHODS[name]
     cls = found if isinstance(found, type) else type(found)
     for setting in settings:
         check_name(f"setting of {cls.__name__}", setting, list(inspect.signature(cls).parameters))

@@ -48,7 +48,7 @@ def test_pettingzoo_agents_in_turn(env_id):
     api_test(make(), num_cycles=12)
     seed_test(make, num_cycles=6)
     state_test(make(), rare_envs.parallel_env(env_id, horizon=1.0), num_cycles=6)
-    raw = rare_envs.registration.raw_env(env_id, agents=["ego"], observation="kinematics", action="meta")
+    raw = rare_envs.env(env_id, agents=["ego"], observation="kinematics", action="meta")
     raw.reset(seed=1)
     assert raw.last()[0].shape == (5, 5) and raw.possible_agents == ["ego"]
     with pytest.raises(AssertionError, match="needs to be called before step"):
