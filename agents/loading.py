@@ -23,7 +23,7 @@ from agents.saved_ego import HUB_PREFIX, find_hub_model, load_saved_ego
 from agents.vision import load_vision
 from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.egos.needs import RULE_BASED_EGOS, wrap_callable
-from rare_envs.plugins import EgoGone, as_errors, did_you_mean, import_object, is_policy, one_line, refuse_ego
+from rare_envs.plugins import EgoGone, did_you_mean, is_policy, make_object, names_object, refuse_ego
 from rare_envs.startup import advise_install
 
 EGO_NAMES = (*RULE_BASED_EGOS, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)
@@ -138,7 +138,7 @@ def find_ego_kind(spec: str) -> str:
 
 def names_function(spec: str) -> bool:
     """Return whether a name has the form of `module:function`, which a file may have too."""
-    return ":" in spec and not {"/", "\\"} & {*spec} and spec.partition(":")[0] not in RULE_BASED_EGOS
+    return names_object(spec) and spec.partition(":")[0] not in RULE_BASED_EGOS
 
 
 def strip_prefixes(spec: str) -> str:
@@ -207,16 +207,9 @@ def _refuse_url(text: str, *_: Any) -> Any:
     raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
 
 
-def _call_factory(spec: str, *_: Any) -> Any:
-    """Return what `module:function` gives: "idm" or an object with `predict`; a plain function is wrapped in one."""
-    function = import_object(spec, f"the ego {spec!r}")
-    if not callable(function):
-        raise ValueError(f"Expected {spec!r} to be a function that returns an ego, got {type(function).__name__}.")
-    try:
-        with as_errors():
-            ego = wrap_callable(function())
-    except Exception as error:  # the function is the user's: anything may happen in it
-        raise ValueError(f"{spec!r}, called without arguments, failed to make an ego: {one_line(error)}.") from error
+def _make_ego(spec: str, *_: Any) -> Any:
+    """Return what `module:name` gives: "idm" or an object with `predict`; a plain function is wrapped in one."""
+    ego = wrap_callable(make_object(spec, "ego"))
     rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
     if not rule_based and not is_policy(ego):
         refuse_ego(ego, f"from {spec!r}")
@@ -243,7 +236,7 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
         lambda spec: spec.endswith(".zip") or isfile(spec),  # of too long a name too
         lambda text, *how: load_saved_ego(Path(text), *how),
     ),
-    "function": (names_function, _call_factory),
+    "function": (names_function, _make_ego),
 }
 """Kinds of ego, the first that holds of a name counts: whether it does, and how the ego is loaded."""
 

@@ -57,6 +57,28 @@ def import_object(spec: str, purpose: str) -> Any:
         raise ValueError(f"{module_name!r} has nothing called {name!r}{hint}.") from None
 
 
+def names_object(spec: str) -> bool:
+    """Return whether a name has the form of "module:name", which a file may have too."""
+    return ":" in spec and not {"/", "\\"} & {*spec}
+
+
+def make_object(spec: str, kind: str, call: bool = True) -> Any:
+    """Return the object of a kind, for messages, that "module:name" stands for.
+
+    A class is called without arguments, and so is a function if it makes the object (`call`) and is not itself it.
+    """
+    found = import_object(spec, f"the {kind} {spec!r}")
+    if not isinstance(found, type) and not (call and inspect.isroutine(found)):
+        return found
+    try:
+        with as_errors():
+            return found()
+    except Exception as error:  # it is the user's: anything may happen in it
+        raise ValueError(
+            f"{spec!r}, called without arguments, failed to make the {kind}: {one_line(error)}."
+        ) from error
+
+
 def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package that imports its names, from the module that has each, and its modules."""
 

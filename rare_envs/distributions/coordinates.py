@@ -35,6 +35,8 @@ class ClosingSpeed:
 
 LEAST_DISTANCE = 1e-300
 """Of a point from an end at 0: one float, 5e-324, may vanish when divided by a standard deviation."""
+LEAST_RANGE = 0.01
+"""Least range that a difference leaves a column, over its widest."""
 CoordinateKind: TypeAlias = Literal["plain", "log"] | ClosingSpeed
 """Kind of the coordinate of a column of x: x itself, log x, or a closing speed."""
 
@@ -120,6 +122,20 @@ class Coordinates:
         """Columns of x in the order of the coordinates."""
         return tuple(map(self.names.index, self.order)) if self.order else tuple(range(self.dim))
 
+    @cached_property
+    def ends(self) -> tuple[FloatArray, FloatArray]:
+        """Ends of the columns, (d,) each: of the box, less where a difference leaves a later column hardly any range.
+
+        All probability of a range that vanishes is at a point, where the density would have no bound.
+        """
+        low, high = self.low.copy(), self.high.copy()
+        for each in self.within:
+            later, earlier = self.names.index(each.column), self.names.index(each.earlier)
+            least = LEAST_RANGE * min(self.high[later] - self.low[later], each.most - each.least)
+            high[earlier] = min(high[earlier], self.high[later] - each.least - least)
+            low[earlier] = max(low[earlier], self.low[later] - each.most + least)
+        return low, high
+
     def line(self, j: int, x: FloatArray) -> tuple[Any, Any]:
         """Return shift and slope, numbers or (n,), of column j (or of its logarithm) as shift + slope y in rows x."""
         kind = self.kinds[j]
@@ -138,7 +154,7 @@ class Coordinates:
 
     def bounds(self, j: int, x: FloatArray) -> tuple[Any, Any]:
         """Return the ends, numbers or (n,), of the coordinate of column j in rows x whose earlier columns are set."""
-        ends = self.low[j], self.high[j]
+        ends = self.ends[0][j], self.ends[1][j]
         for each in self.within:
             if self.names[j] == each.column:
                 other = np.ascontiguousarray(x[:, self.names.index(each.earlier)])
@@ -188,8 +204,8 @@ class Coordinates:
         return np.stack([np.clip(self.coordinate(j, inner), *self.bounds(j, inner)) for j in self.columns], axis=1)
 
     def interior(self, x: FloatArray) -> FloatArray:
-        """Return points with those on a face moved off it, by one float."""
-        return move_inside(x, self.low, self.high)
+        """Return points with those on a face moved off it, by one float, and those beyond the `ends` to these."""
+        return move_inside(x, *self.ends)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of a base file: `low` and `high`, and what is not as by default."""

@@ -26,14 +26,14 @@ from rare_envs.measures.base import (
     TraceMeasure,
 )
 from rare_envs.measures.temporal_logic import stl
-from rare_envs.plugins import did_you_mean, import_object
+from rare_envs.plugins import did_you_mean, make_object
 from rare_envs.traffic.crash import crash_of
 
 FORMULA = "stl:"
 
 
 def load_measure(measure: Any) -> Any:
-    """Return what "stl:FORMULA" or "module:name" (a function or a measure) stands for; all else as it is."""
+    """Return what "stl:FORMULA" or "module:name" (a function, a measure or its class) stands for; all else as it is."""
     if not isinstance(measure, str) or ":" not in measure:
         return measure
     if measure.startswith(FORMULA):
@@ -41,7 +41,7 @@ def load_measure(measure: Any) -> Any:
             return stl(measure.removeprefix(FORMULA).strip())
         except ImportError as error:
             raise ValueError(str(error)) from error
-    return import_object(measure, f"the measure {measure!r}")
+    return make_object(measure, "measure", call=False)
 
 
 def _negative_contact_speed(moment: Moment) -> Tensor:

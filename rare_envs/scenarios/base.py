@@ -20,7 +20,7 @@ from rare_envs.devices import scalars
 from rare_envs.distributions.fitted import FITTED_KEYS, FileDistribution, FittedDistribution, read_distribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.files import parse_json_object, read_text_file
-from rare_envs.plugins import did_you_mean
+from rare_envs.plugins import did_you_mean, make_object, names_object
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State, point_mass
 
@@ -223,8 +223,9 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
 
     Args:
         scenario: The scenario.
-        base: The name of one of `scenario.bases`, a path to a JSON file, or an object with the four methods of
-            `Distribution`; None for the scenario's default, which is its first.
+        base: The name of one of `scenario.bases`, a path to a JSON file, an object with the four methods of
+            `Distribution`, or "module:name" of what makes such an object without arguments; None for the scenario's
+            default, which is its first.
 
     Raises:
         ValueError: There is no such file, or it does not fit the scenario.
@@ -236,6 +237,8 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     """
     base = scenario.default_base if base is None else base
     found: Any = scenario.bases.get(str(base), Path(base)) if isinstance(base, str | PathLike) else base
+    if isinstance(found, Path) and names_object(str(base)) and not found.exists():
+        found = make_object(str(base), "base distribution")
     where = (scenario.name, tuple(p.name for p in scenario.parameters), str(base))
     if isinstance(found, Mapping):
         box = scenario.column_parameters

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import IDLE, MAX_ACCELERATION, MAX_STEERING
 from rare_envs.devices import constant
-from rare_envs.plugins import as_errors, check_name, import_object, one_line
+from rare_envs.plugins import as_errors, check_name, make_object, one_line
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.settings import Clock
 from rare_envs.simulation.world import World
@@ -163,7 +163,7 @@ def find_reward(reward: Any) -> EgoReward:
     """
     if reward is None:
         return reward_terms
-    reward = import_object(reward, "the reward") if isinstance(reward, str) else reward
+    reward = make_object(reward, "reward", call=False) if isinstance(reward, str) else reward
     if isinstance(reward, Mapping) and reward:
         return _weigh(reward)
     if not callable(reward):

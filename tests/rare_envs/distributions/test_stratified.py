@@ -1,5 +1,7 @@
 """Strata and accepted gaps: exact maps, densities that integrate to one, and shares that are as said."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import integrate, stats
@@ -170,3 +172,18 @@ def test_points_far_out_go_there_and_back_as_finite_numbers(env_id: str) -> None
     x = base.from_standard_normal(u)
     assert ((x >= base.low) & (x <= base.high)).all()
     assert np.isfinite(base.to_standard_normal(x)).all() and not np.isnan(base.log_prob(x)).any()
+
+
+def test_the_density_has_a_bound_at_the_corners_of_a_box_that_a_difference_cuts() -> None:
+    """A lead that slows keeps 1 m/s or more: at a loss of 44 m/s its speed would have the range from 45 to 45 m/s."""
+    for stratum in load_base(find_scenario("hard_brake"), "us101").strata:
+        low, high = np.array(stratum.base.low), np.array(stratum.base.high)
+        share = np.array(list(itertools.product((0.0, 0.001, 0.01, 0.5, 0.99, 0.999, 1.0), repeat=4)))
+        x = low + share * (high - low)
+        x[:, 3] = np.clip(x[:, 3], low[3], np.minimum(x[:, 0] - 1.0, high[3]))  # the difference at its end
+        assert (
+            stratum.base.log_prob(x).max()
+            < stratum.base.log_prob(stratum.base.sample(2000, np.random.default_rng(0))).max() + 1.0
+        )
+    near = np.array([[45.0, 57.0, 4.2, 44.0], [44.999, 57.0, 4.2, 43.999], [44.9, 57.0, 4.2, 43.5]])
+    assert np.exp(load_base(find_scenario("hard_brake"), "us101").log_prob(near)).max() < 1e-12
