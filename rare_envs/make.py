@@ -13,7 +13,7 @@ from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
 from rare_envs.egos.policy import find_policies
 from rare_envs.measures.registry import load_measure
-from rare_envs.plugins import check_name, did_you_mean
+from rare_envs.plugins import check_name, did_you_mean, make_object, names_object
 from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario, split_layout
 from rare_envs.sensors.camera import find_camera
@@ -70,8 +70,8 @@ def set_up(
         base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
             distribution object; None takes the scenario's default.
         drivers: Drivers of the vehicles around the ego: "mgail", "mgail?rules=0", "gail", "idm", "idm+mobil"
-            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`; or of
-            single ones, see `rare_envs.egos.policy.find_policies`. None takes the scenario's default, which is its
+            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`,
+            "module:name" of what makes one; or of single ones, see `rare_envs.egos.policy.find_policies`. None takes the scenario's default, which is its
             script but for the highway. The weights of learned drivers are parameters of the scenario.
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
@@ -96,6 +96,8 @@ def set_up(
     check_name("action", action, ACTIONS)
     if not isinstance(weather, bool):
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
+    if isinstance(drivers, str) and "=" not in drivers and names_object(drivers):
+        drivers = make_object(drivers, "drivers")
     policies = find_policies(drivers, scenario)
     background = find_drivers(scenario.drivers if drivers is None or policies else drivers)
     lidar = needs.lidar or any("lidar" in policy.driver.observation for policy in policies)

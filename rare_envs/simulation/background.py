@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from rare_envs.plugins import check_name, make_object, names_object
+from rare_envs.plugins import check_name
 from rare_envs.traffic.bodies import LaneTraffic
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -149,10 +149,9 @@ def noise_size(ticks: int, vehicles: int) -> int:
 def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     """Return the drivers that a keyword argument `drivers` names: None for the scenario's script, or a ValueError.
 
-    A `Background` or `TrafficBackground`, "module:name" of what makes one, the name of an installed one ("mgail"; "idm+mobil" and "mgail?rules=0" are
+    A `Background` or `TrafficBackground`, the name of an installed one ("mgail"; "idm+mobil" and "mgail?rules=0" are
     looked up as "idm" and "mgail", whose loaders get the whole name), or a file that the package `agents` wrote.
     """
-    drivers = make_object(drivers, "drivers") if isinstance(drivers, str) and names_object(drivers) else drivers
     if drivers is None or isinstance(drivers, Background | TrafficBackground):
         return drivers
     if not isinstance(drivers, str | Path):
