@@ -70,9 +70,10 @@ def set_up(
         base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
             distribution object; None takes the scenario's default.
         drivers: Drivers of the vehicles around the ego: "mgail", "mgail?rules=0", "gail", "idm", "idm+mobil"
-            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`,
-            "module:name" of what makes one; or of single ones, see `rare_envs.egos.policy.find_policies`. None takes the scenario's default, which is its
-            script but for the highway. The weights of learned drivers are parameters of the scenario.
+            (which changes lanes too), the path of a driver's file, a `Background` or a `TrafficBackground`, or
+            "module:name" of what makes one; or policies in single vehicles, see `rare_envs.egos.policy.find_policies`.
+            None takes the scenario's default, which is its script but for the highway. The weights of learned drivers
+            are parameters of the scenario.
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.

@@ -52,7 +52,7 @@ UNKNOWN = {
     "noisy:?latency=0.1": "Expected an ego behind 'noisy:'",
     "process:": "Expected an ego behind 'process:'",
     ":make": "Expected module:name",
-    "math:pi": "Expected 'math:pi' to be a function that returns an ego, got float",
+    "math:pi": r"Expected 'idm' or an object with a method predict\(observation, ...\), got float from 'math:pi'",
     "no_such_module:make": "Cannot import 'no_such_module'",
     "https://example.org/ego.zip": r"Will not load an ego from 'https://example\.org/ego\.zip': download",
     "idm?headway=2": r"Unknown setting 'headway' \(did you mean 'time_headway'\?\); expected desired_speed",

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -71,3 +72,36 @@ def test_entries_say_their_version_and_no_version_of_the_package_is_called_out_o
     assert done.stdout.split() == ["rare_envs/CutIn-v0", "rare_envs/CutIn-kinematics-v0", "CartPole-v0"]
     assert "CartPole-v0 is out of date" in done.stderr
     assert "rare_envs/" not in done.stderr
+
+
+def test_a_class_or_a_function_of_a_module_in_the_working_directory_makes_what_a_name_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "made_here" / "inner").mkdir(parents=True)  # folders without __init__.py, as `python -m` finds them
+    (tmp_path / "made_here" / "inner" / "parts.py").write_text(
+        "import numpy as np\n"
+        "from rare_envs.scenarios import find_scenario, load_base\n"
+        "class Coasting:\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
+        "        return np.zeros((len(observation), 2), np.float32), None\n"
+        "def make_base():\n"
+        "    return load_base(find_scenario('cut_in'), 'i80')\n"
+        "def gap(moment):\n"
+        "    return moment.lead.gap.clamp(max=100.0)\n"
+        "def broken(which):\n"
+        "    return which\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    parts = "made_here.inner.parts"
+    own = {"ego": f"{parts}:Coasting", "base": f"{parts}:make_base", "measure": f"{parts}:gap"}
+    problem = rare_envs.DrivingProblem("cut_in", drivers=f"cutter={parts}:Coasting", **own)  # type: ignore[arg-type]
+    x = rare_envs.DrivingProblem("cut_in", base="i80").base.sample(4, np.random.default_rng(0))
+    np.testing.assert_array_equal(problem.base.sample(4, np.random.default_rng(0)), x)
+    assert (problem.evaluate(x) <= 100.0).all() and problem.given == f"{parts}:Coasting drives the cutter"
+    for name in ("ego", "base", "drivers"):
+        with pytest.raises(
+            ValueError, match=rf"^'{parts}:broken', called without arguments, failed to make the {name}"
+        ):
+            rare_envs.DrivingProblem("cut_in", **{name: f"{parts}:broken"})
+    for name in [each for each in sys.modules if each.startswith("made_here")]:
+        del sys.modules[name]
