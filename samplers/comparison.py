@@ -23,16 +23,20 @@ from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.methods import Auto
 from samplers.output import (
+    LABEL,
     Kept,
+    Row,
     drawing_axes,
+    fold_rows,
     format_alike,
     indent_lines,
     register_stored,
+    say,
     to_json_value,
 )
 from samplers.problem import FloatArray, Problem, check_number, check_whole, names_of_columns, one_per_row
 from samplers.replicate import UNRESOLVED_SHARE
-from samplers.result import Estimate, without_base
+from samplers.result import Estimate, describe_limit, describe_odds, list_warnings, without_base
 from samplers.run import Listener, RunArguments, check_problem
 from samplers.sample import Interval, bound_missed, degrees_of_freedom, effective_number
 
@@ -120,9 +124,7 @@ class Comparison(Kept):
         reason = "no failure of A or B was found" if math.isnan(self.ratio) else reason
         if base is not None:
             ends = base.interval or (0.0, math.inf)
-            doubt = (
-                "" if base.interval else base.reason.rstrip(".") or "too few recordings for an interval of the ratio"
-            )
+            doubt = "" if base.interval else base.reason.rstrip(".")
             reason = reason or doubt or find_doubt(base.warnings)
         low, high = (math.inf if end == 0 else 1.0 / end for end in reversed(ends))
         if_exact = None if base is None else self.meets(max_ratio, True).decision
@@ -177,26 +179,29 @@ class Comparison(Kept):
         if self._has_ratio:
             return f"p_A / p_B = {format_alike(self.ratio)[0]}"
         if math.isnan(self.ratio):
-            return "p_A / p_B not known (no failure of A or B was found)"
-        bound, name = ("below {1}", "A") if self.ratio == 0 else ("above {0}", "B")
-        bound = bound.format(*format_alike(low, high))
-        return f"p_A / p_B {bound} ({100 * self.confidence:g} % one-sided limit; no failure of {name} was found)"
+            return "p_A / p_B not known"
+        return (
+            f"p_A / p_B {'below' if self.ratio == 0 else 'above'} {format_alike(high if self.ratio == 0 else low)[0]}"
+        )
 
     def __repr__(self) -> str:
         ends = " [{}, {}]".format(*format_alike(*self.interval)) if self._has_ratio else ""
         return f"<Comparison {self._ratio_text}{ends}, {self.n_sim:,} simulations>"
 
     def __str__(self) -> str:
-        lines = [self._ratio_text]
-        if self._has_ratio:
-            low, high = format_alike(*self.interval)
-            lines.append(f"  {100 * self.confidence:g} % interval {low} to {high}")
-        lines += indent_lines(self.base_uncertainty)
-        for name, side in (("A", self.a), ("B", self.b)):
-            lines.append("  p_{} = {} ({} to {})".format(name, *format_alike(side.p, *side.interval)))
-        both, a, b = format_alike(*list(self.shares.values())[:3])
-        lines.append(f"  of all draws {both} fail both, {a} only A, {b} only B, {self.shares['neither']:.8g} neither")
-        lines.append(f"  {self.n_sim:,} simulations, half of them of each")
+        more = ("Details", say("next", command="comparison.details()", what=say("details")))
+        return "\n".join(fold_rows([*list_ratio_facts(self), *list_warnings(self.all_warnings), more]))
+
+    @property
+    def all_warnings(self) -> tuple[str, ...]:
+        """Warnings of the ratio, and of its error from a fitted base."""
+        return (*self.warnings, *(() if self.base_uncertainty is None else self.base_uncertainty.warnings))
+
+    def details(self) -> str:
+        """Return the ratio and both probabilities with all intervals and warnings, in a text."""
+        lines = [*fold_rows(list_ratio_facts(self), 1_000), *indent_lines(self.base_uncertainty)]
+        covs = " and ".join("not known" if math.isinf(side.cov) else f"{side.cov:.2g}" for side in (self.a, self.b))
+        lines.append(f"  c.o.v. {covs}; {self.n_sim:,} simulations, half of them of each")
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
     def to_dict(self) -> dict[str, Any]:
@@ -210,6 +215,51 @@ class Comparison(Kept):
             "b": asdict(self.b),
         }
         return {key: to_json_value(value) for key, value in data.items()}
+
+
+def list_ratio_facts(
+    found: Comparison, a: str = "A", b: str = "B", fails: str = "fails", model: str = "base distribution"
+) -> list[Row]:
+    """Return the ratio with its widest interval, what limits that, and p of each and of both, each in a sentence.
+
+    `a` and `b` are the names of the two, `fails` the verb of a failure, `model` what x is drawn from.
+    """
+    base, sure, own = found.base_uncertainty, f"{100 * found.confidence:g} %", found.interval
+    about = {"a": a, "b": b, "fails": fails, "sure": sure}
+    ends = own if base is None else base.interval
+    limit, left_out = f"{found.n_sim:,}", ""
+    if ends is None and base is not None:
+        left_out = say("error not known", model=model, reason=base.reason.rstrip("."))
+    if not found._has_ratio:
+        fact = "ratio of a safe one" if found.ratio == 0 else "ratio to a safe one"
+        low, high = format_alike(*own)
+        text = say("ratio not known" if math.isnan(found.ratio) else fact, low=low, high=high, **about)
+        limit = say("limited by simulations", n=limit, few="")
+    elif ends is None:
+        ratio, low, high = format_alike(found.ratio, *own)
+        text = say("ratio without limits", ratio=ratio, **about)
+        limit = f"{base.fitted_to}{say('if the model is exact', low=low, high=high, model=model)}" if base else ""
+    else:
+        ratio, low, high = format_alike(found.ratio, *ends)
+        text = say("ratio", ratio=ratio, low=low, high=high, **about)
+        text += say("undecided which", fails=fails) if ends[0] <= 1 <= ends[1] else ""
+        limit = describe_limit(found.ratio, own, ends, limit, model, base)
+    exact = "" if base is None else say("with an exact model", model=model)
+    labels = (name if len(name) < LABEL - 1 else letter for name, letter in ((a, "A"), (b, "B")))
+    sides = [(name, _describe_side(side, exact)) for name, side in zip(labels, (found.a, found.b), strict=True)]
+    rows = [("Ratio", text), ("Limited by", limit), ("Left out", left_out), *sides]
+    if found._has_ratio:
+        both, first, second = format_alike(*list(found.shares.values())[:3])
+        rows.append(("Together", say("shares", both=both, a=a, first=first, b=b, second=second)))
+    return [row for row in rows if row[1]]
+
+
+def _describe_side(side: Side, exact: str) -> str:
+    """Return p of one of the two with its interval, which holds if the base is `exact`."""
+    p, low, high = format_alike(side.p, *side.interval)
+    if side.p == 0:
+        return say("side without a failure", high=high, exact=exact)
+    return say("side", p=p, odds=describe_odds(side.p), low=low, high=high, exact=exact)
 
 
 register_stored(Comparison, Side)

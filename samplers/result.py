@@ -38,6 +38,7 @@ from samplers.sample import (
     Closest,
     DrawWeights,
     Failures,
+    Interval,
     Layer,
     Level,
     Sample,
@@ -496,12 +497,15 @@ def _describe_p(estimate: Estimate, noun: str) -> str:
         high = max(high, estimate.bound_missed(0.5 + estimate.confidence / 2))  # that of a search may be far lower
         fact = "failures of the search alone" if found else "nothing failed"
         return say(fact, n=f"{estimate.n_sim:,}", found=f"{found:,}", high=format_alike(high)[0], sure=sure)
-    odds = ""
-    if LEAST_ODDS < estimate.p < 0.1:
-        odds = f" (1 in {float(f'{1 / estimate.p:.2g}'):,.0f}{noun and f' {noun}'})"
+    odds = describe_odds(estimate.p, noun)
     p, below, above = format_alike(estimate.p, low, high)
     fact = "p" if low > 0 else "p without a lower limit" if high < 1 else "p without limits"
     return say(fact, p=p, odds=odds, low=below, high=above, sure=sure)
+
+
+def describe_odds(p: float, noun: str = "") -> str:
+    """Return a small p as " (1 in n)", of what `noun` says; empty if it is large, or too small to be read so."""
+    return f" (1 in {float(f'{1 / p:.2g}'):,.0f}{noun and f' {noun}'})" if LEAST_ODDS < p < 0.1 else ""
 
 
 def _describe_limit(estimate: Estimate, model: str) -> str:
@@ -510,22 +514,27 @@ def _describe_limit(estimate: Estimate, model: str) -> str:
     ends = sorted(((part.share * part.interval[1], part.name) for part in vague), reverse=True)
     few = "".join(say("too few failures", name=part, high=format_alike(high)[0]) for high, part in ends[:NAMED_STRATA])
     few += f"; {len(ends) - NAMED_STRATA} more strata" if len(ends) > NAMED_STRATA else ""
-    of_events = 1 - _share_of_simulations(estimate)
+    own, ends = estimate.sequence or estimate.interval, find_ends(estimate, base)
+    return describe_limit(estimate.p, own, ends, n, model, base, few)
+
+
+def describe_limit(
+    value: float, own: Interval, ends: Interval, n: str, model: str, base: BaseUncertainty | None, few: str = ""
+) -> str:
+    """Return whether events or n simulations limit the interval `ends` of a value; `own` is that of simulations alone.
+
+    The share of the simulations is that in the squared upper half of log value.
+    """
+    of_events = 0.0
+    if 0 < value < ends[1]:
+        of_events = 1 - min(1.0, (math.log(max(own[1], value) / value) / math.log(ends[1] / value)) ** 2)
     if base is None or of_events < NEGLIGIBLE:
         return say("limited by simulations", n=n, few=few)
-    low, high = format_alike(*(estimate.sequence or estimate.interval))
+    low, high = format_alike(*own)
     exact = say("if the model is exact", low=low, high=high, model=model)
     fact = "limited by events" if of_events > 1 - NEGLIGIBLE else "limited by both"
     share, rest = (f"{100 * part:.0f} %" for part in (of_events, 1 - of_events))
     return say(fact, events=base.fitted_to, n=n, few=few, share=share, rest=rest, exact=exact)
-
-
-def _share_of_simulations(estimate: Estimate) -> float:
-    """Return the share of the simulations in the squared upper half of the widest interval of log p."""
-    (_, own), (_, high) = estimate.sequence or estimate.interval, find_ends(estimate, estimate.base_uncertainty)
-    if not 0 < estimate.p < high:
-        return 1.0
-    return min(1.0, (math.log(max(own, estimate.p) / estimate.p) / math.log(high / estimate.p)) ** 2)
 
 
 register_stored(StoredEstimate, Estimate, Outcome, Part, BaseUncertainty, Failures, Level, Status, StoredMethod)

@@ -54,6 +54,7 @@ from rare_envs.study.question import (
 )
 from rare_envs.study.report import Repeatability, Report, find_frequency
 from rare_envs.study.run_folder import BLOCKS, COMPARISON, FAILURES, RESULT_FILES, STUDY
+from rare_envs.study.text import describe_comparison
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
@@ -532,13 +533,12 @@ def _describe_comparison(found: samplers.comparison.Comparison, studies: Mapping
     inputs = {key: value for key, value in asdict(a).items() if key not in UNUSED_FIELDS}
     verdict = None if a.max_ratio is None else found.meets(a.max_ratio, a.assume_traffic)
     notes = [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes]
-    said = [f"A = {a.ego}, B = {b.ego}, {a.env_id}", *str(found).splitlines()]
     return {
         **found.to_dict(),
         "question": {"ego_a": inputs.pop("ego"), "ego_b": b.ego, **inputs, "algo_b": b.algo, "stats_b": b.stats},
         "gate": None if verdict is None else verdict.to_dict(),
         "notes": notes,
-        "text": [*said, *(f"  note: {note}" for note in notes)],
+        "text": describe_comparison(found, a, b.ego),
         "version": __version__,
     }
 

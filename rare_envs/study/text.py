@@ -28,6 +28,7 @@ from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.replay import describe_contact
 from rare_envs.study.report import MODEL_NOUN, Report, describe_left_out, explain_other_events
+from samplers.comparison import list_ratio_facts
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows, format_alike, indent_lines, say
 from samplers.problem import FloatArray
 from samplers.result import list_facts, list_warnings
@@ -339,6 +340,14 @@ def describe_answer(report: Report, last: Sequence[Row] = (), most: int = MOST_L
     rows = [*facts, *_list_rates(report), (what, _describe_crashes(report)), missed]
     head = textwrap.wrap(title, WIDTH, subsequent_indent="  ")
     return [*head, *fold_rows([*rows, *list_warnings(report.warnings), *last], most - len(head))]
+
+
+def describe_comparison(found: samplers.comparison.Comparison, question: Question, ego_b: str) -> list[str]:
+    """Return the comparison of a question's ego with another one in at most `MOST_LINES` - 1 lines."""
+    a, b = (Path(ego).name if Path(ego).suffix else ego for ego in (question.ego, ego_b))
+    fails = "crashes" if name_p(question) == CRASHES else "fails"
+    rows = [*list_ratio_facts(found, a, b, fails, MODEL_NOUN), *list_warnings(found.all_warnings)]
+    return [f"{a} (A) against {b} (B) in {question.env_id}", *fold_rows(rows, MOST_LINES - 2)]
 
 
 def report_as_json(report: Report) -> dict[str, Any]:

@@ -65,6 +65,10 @@ def test_monte_carlo_with_hand_counted_hits():
     assert "of all draws 0.010 fail both, 0.030 only A, 0.010 only B, 0.95 neither" in str(found)
     assert found.interval[0] < 1.0 < found.interval[1]
     assert "imprecise" in found.warnings[-1]
+    assert "A fails 2.0 times as often as B; 95 % interval " in str(found) and ": undecided which one fails" in str(
+        found
+    )
+    assert "\nTogether     both 0.010, only A 0.030, only B 0.010\n" in str(found)
 
 
 def test_problems_with_another_x_are_refused():
@@ -94,13 +98,14 @@ def test_a_budget_is_for_both(max_sim):
 def test_without_failures_of_one_the_text_has_a_bound():
     a, never = half_space(2.0, [1.0, 0]), half_space(30.0, [1.0, 0])
     above, below = (samplers.compare(*two, seed=0, max_sim=4000) for two in ((a, never), (never, a)))
-    for found, end, other in (
-        (above, f"above {float(f'{above.interval[0]:.2g}'):.0f}", "B"),
-        (below, f"below {below.interval[1]:#.2g}", "A"),
+    for found, limit, safe in (
+        (above, f"more than {float(f'{above.interval[0]:.2g}'):.0f}", "B"),
+        (below, f"less than {below.interval[1]:#.2g}", "A"),
     ):
-        assert str(found).startswith(f"p_A / p_B {end} (95 % one-sided limit; no failure of {other} was found)")
+        assert f"A fails {limit} times as often as B (95 %); no failure of {safe} found\n" in str(found)
+        assert f"\n{safe}            no failure found; below " in str(found)
     neither = samplers.compare(never, never, "mc", seed=0, max_sim=200)
-    assert str(neither).startswith("p_A / p_B not known (no failure of A or B was found)")
+    assert str(neither).startswith("Ratio        not known: no failure of A or B found\n")
     for found in (above, below, neither):
         assert "inf" not in str(found) + repr(found)
         assert "nan" not in str(found) + repr(found)

@@ -105,7 +105,7 @@ def test_the_ratio_of_an_ego_that_brakes_and_one_that_does_not(cli, risky, here)
     assert failures["gap"].shape == failures["log_p0"].shape == failures["f"].shape
     assert cli("replay", "run").exit_code == 2
     text = cli(*words).stdout
-    assert "A = egos_here:coasting, B = idm" in text and f"p_A / p_B = {found['ratio']:.2g}" in text
+    assert "egos_here:coasting (A) against idm (B) in " in text and f"fails {found['ratio']:.2g} times" in text
 
 
 def test_an_ego_that_answers_at_random_is_named(cli, risky, here):

@@ -66,7 +66,7 @@ def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
     assert found.bound == pytest.approx(min(1.0, result.p * math.exp(half)), rel=1e-6)
     assert "too few recorded events for limits in this family" in result.details()
     assert "predictive mean" not in result.details()
-    assert "neither a lower nor an upper limit (95 %)\nLimited by   " in str(result)
+    assert "no lower or upper limit (95 %)\nLimited by   " in str(result)
     assert "too few recorded events for a lower limit; below 0.010 in this family" in str(replace(found, bound=0.01))
 
 

@@ -27,7 +27,7 @@ def test_two_sides_of_one_run():
     assert ratio.interval[0] < found.interval[0] < found.interval[1] < ratio.interval[1]
     whole = found.either.base_uncertainty
     assert math.log(ratio.interval[1] / ratio.interval[0]) < 0.5 * math.log(whole.interval[1] / whole.interval[0])
-    text = str(found)
+    text = found.details()
     assert f"  base distribution 95 %  {ratio.interval[0]:.2g} to {ratio.interval[1]:.2g} (38 + 15 events" in text
     assert "errors of the family are not included" in text
     assert json.loads(json.dumps(found.to_dict()))["base_uncertainty"]["value_refits"] == list(ratio.value_refits)
@@ -47,7 +47,7 @@ def test_the_further_run_of_a_comparison_simulates_both():
     assert 0 < found.n_sim <= 6000
     assert 0 < found.base_uncertainty.n_sim <= 6000
     assert np.log(found.base_uncertainty.value_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
-    assert f"{found.base_uncertainty.n_sim:,} more simulations from the mixture of the refits" in str(found)
+    assert f"{found.base_uncertainty.n_sim:,} more simulations from the mixture of the refits" in found.details()
     forbidden = samplers.compare(*both, seed=2, max_sim=6000, ensemble_run=False)
     assert forbidden.base_uncertainty.n_sim == 0
     assert "rest on fewer than 10" in forbidden.base_uncertainty.warnings[0]
