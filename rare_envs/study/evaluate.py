@@ -538,7 +538,7 @@ def _describe_comparison(found: samplers.comparison.Comparison, studies: Mapping
         "question": {"ego_a": inputs.pop("ego"), "ego_b": b.ego, **inputs, "algo_b": b.algo, "stats_b": b.stats},
         "gate": None if verdict is None else verdict.to_dict(),
         "notes": notes,
-        "text": describe_comparison(found, a, b.ego),
+        "text": [*describe_comparison(found, a, b.ego), *(f"note: {note}" for note in notes)],
         "version": __version__,
     }
 

@@ -62,13 +62,11 @@ def test_monte_carlo_with_hand_counted_hits():
     assert (found.ratio, found.a.p, found.b.p, found.both) == pytest.approx((2.0, 0.04, 0.02, 0.01))
     shares = {"both": 0.01, "only_a": 0.03, "only_b": 0.01, "neither": 0.95}
     assert found.shares == found.to_dict()["shares"] == pytest.approx(shares)
-    assert "of all draws 0.010 fail both, 0.030 only A, 0.010 only B, 0.95 neither" in str(found)
     assert found.interval[0] < 1.0 < found.interval[1]
     assert "imprecise" in found.warnings[-1]
-    assert "A fails 2.0 times as often as B; 95 % interval " in str(found) and ": undecided which one fails" in str(
-        found
-    )
-    assert "\nTogether     both 0.010, only A 0.030, only B 0.010\n" in str(found)
+    text = str(found)
+    assert "A fails 2.0 times as often as B; 95 % interval " in text and ": undecided which one" in text
+    assert "\nTogether     both 0.010, only A 0.030, only B 0.010\n" in text
 
 
 def test_problems_with_another_x_are_refused():

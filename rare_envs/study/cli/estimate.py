@@ -353,7 +353,6 @@ def _tell_comparison(details: bool, pair: tuple[Comparison, dict[str, Any]], out
     (found, answer), asked = pair, pair[1]["question"]
     verdict = None if asked["max_ratio"] is None else found.meets(asked["max_ratio"], asked["assume_traffic"])
     lines = [*answer["text"], *(["", found.details(), "", found.either.details()] if details else [])]
-    lines += [f"note: {note}" for note in answer["notes"]]
     lines += [*([] if out is None else [f"Wrote {out}."]), *list_gate(verdict)]
     code = (DOUBTFUL if found.warnings else 0) if verdict is None else GATE_CODES[verdict.decision]
     return Answer(answer, "\n".join(lines), code)
