@@ -29,6 +29,7 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_folder, read_question
+from rare_envs.study.failures import OTHER_DRIVERS
 from rare_envs.study.question import build_problem, note_question, open_question, open_run
 from rare_envs.study.replay import REPLAY_TOLERANCE, join_parts
 from rare_envs.study.run_folder import CRASH, LoadedStudy, load_finished
@@ -147,7 +148,8 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
 def list_failures(run: LoadedStudy, trust: bool = False, **given: Any) -> list[StoredFailure]:
     """Return the failures of a run, the most likely first; no ego is loaded. `given` is as for `open_question`."""
     question, table = replace(open_run(run, trust, **given), ego=read_question(run.question).ego), run.failures
-    names = [name for name in table if name not in ("f", "log_p0", *CRASH)]
+    others = [f"f_{name}" for name in OTHER_DRIVERS]
+    names = [name for name in table if name not in ("f", "log_p0", *CRASH, *others)]
     if not names or not all(np.isfinite(table[name]).all() for name in names):
         raise BadInput(f"The files of failures in {str(run.folder)!r} are damaged: a parameter is no number.")
     rows = zip(table["f"], table["log_p0"], table.get(CRASH[0], [""] * len(table["f"])), strict=True)

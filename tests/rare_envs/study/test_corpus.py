@@ -76,6 +76,16 @@ def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:
     assert chosen[0] == recorded[0] and recorded[0].log_p0 >= recorded[-1].log_p0
 
 
+def test_what_another_driver_does_in_a_failure_is_no_parameter(run: Path) -> None:
+    header, first, *rows = (run / "failures.csv").read_text().splitlines()
+    assert header.endswith(",f_idm")
+    unknown = first.rpartition(",")[0] + ","  # it could not drive
+    (run / "failures.csv").write_text("\n".join([header, unknown, *rows]) + "\n")
+    with pytest.warns(UserWarning, match=r"failures\.csv"):
+        study = load_finished(run)
+    assert {tuple(each.x) for each in list_failures(study)} == {("ego_speed", "lead_speed", "gap")}
+
+
 def test_a_run_with_a_damaged_parameter_is_refused(run: Path) -> None:
     table = (run / "failures.csv").read_text()
     (run / "failures.csv").write_text(table.replace(table.splitlines()[1].split(",")[0], "nan"))
