@@ -260,6 +260,9 @@ class Question:
             raise ValueError("Expected max_p or max_rate, not both: one run has one limit.")
         if self.max_p is not None and not 0.0 < self.max_p < 1.0:
             raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
+        if self.target_cov is not None and 1.0 <= self.target_cov < 100.0:
+            wanted = f"{self.target_cov:g} % is {self.target_cov / 100:g}"
+            raise ValueError(f"Expected target_cov below 1, got {self.target_cov:g}: {wanted}.")
         for name in ("max_rate", "max_ratio"):
             if (limit := getattr(self, name)) is not None and not 0.0 < limit < math.inf:
                 raise ValueError(f"Expected {name} above 0, got {limit!r}.")

@@ -102,7 +102,7 @@ def run(
         >>> report.estimate.p, report.estimate.n_sim
         (0.021, 1000)
     """
-    start, study = time.perf_counter(), settle_chunk(study, executor is not None)
+    start, study = time.perf_counter(), settle_chunk(study, executor is not None and journal is None)
     advice = "" if journal else " With --out finished simulations would have been kept."
     question = study.question
     if question.max_rate is not None:
@@ -361,8 +361,7 @@ def _in_batches_of(journal: Journal | None, study: Study) -> Study:
     """Return a study in the batches in which its journal was begun."""
     if journal is None:
         return study
-    chunk = journal.head["question"]["chunk"]
-    return replace(study, question=replace(study.question, chunk=chunk or study.problem.tile))
+    return replace(study, question=replace(study.question, chunk=journal.head["question"]["chunk"]))
 
 
 def resume(
@@ -390,8 +389,6 @@ def resume(
                 "are of what it was before. Start again with --force."
             )
         study = prepare(question)
-        if question.chunk is None and executor is not None:  # it is continued in the batches in which it was begun
-            study = replace(study, question=replace(question, chunk=study.problem.tile))
         writing.note_resumption(folder, journal.earlier_seconds)
         if ego is not None and list(list_risks(question)) == ["ego"]:
             note_question(study.question)  # the address is the reader's own
@@ -491,8 +488,9 @@ def _compare(
         contextlib.ExitStack() as stack,
     ):
         kept, evaluators = dict[str, RowKeeper](), dict[str, Evaluator]()
-        for (name, study), journal in zip(studies.items(), journals, strict=True):
-            evaluators[name] = _evaluator_of(_in_batches_of(journal, study), journal, executor)
+        for name, journal in zip([*studies], journals, strict=True):
+            studies[name] = _in_batches_of(journal, studies[name])
+            evaluators[name] = _evaluator_of(studies[name], journal, executor)
             kept[name] = RowKeeper(question.gamma)
             evaluators[name].watchers.append(kept[name].keep)
         try:

@@ -269,6 +269,9 @@ def load_study(folder: str | Path) -> LoadedStudy:
     """
     path = Path(folder)
     if not all((path / name).is_file() for name in (RESULT, FAILURES)):
+        parts = [str(part.parent) for part in sorted(path.glob(f"*/{RESULT}"))]
+        if parts:
+            raise BadInput(f"{str(folder)!r} has several runs, expected one of them: {', '.join(parts[:9])}.")
         raise BadInput(
             f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out "
             f"writes, but {_say_what_is_there(path)}."

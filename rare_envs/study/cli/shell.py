@@ -50,7 +50,8 @@ _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
 _PLAIN_WORDS = (
     (r"Value error, ", ""),
-    (r"Input should be a valid number, unable to parse string as a number", "expected a number"),
+    (r"Input should be a valid number, unable to parse string as a number", "expected a number, such as 0.05"),
+    (r"Input should be greater than or equal to", "expected at least"),
     (r"Input should be a valid integer, unable to parse string as an \w+", "expected a whole number"),
 )
 """What Typer says of a wrong value in words of the library that it checks values with, and what is said instead."""
@@ -172,6 +173,20 @@ ELSEWHERE = {
     "bench": "python -m benchmarks.samplers",
 }
 """Words that are no command, and the command that does what they say."""
+
+
+SYNONYMS = {
+    **dict.fromkeys(("--cov", "--precision", "--target"), "--target-cov"),
+    **dict.fromkeys(("--pilot", "--budget", "--samples", "--simulations", "--n-sim", "--n"), "--max-sim"),
+    **dict.fromkeys(("--given-base", "--assume-base"), "--assume-traffic"),
+    **dict.fromkeys(("--jobs", "--threads", "--processes", "--n-jobs"), "--workers"),
+    **dict.fromkeys(("--policy", "--model"), "--ego"),
+    **dict.fromkeys(("--traffic", "--bases", "--distribution"), "--base"),
+    **dict.fromkeys(("--output", "--folder", "--dir"), "--out"),
+    **dict.fromkeys(("--most", "--max"), "--limit"),
+    **dict.fromkeys(("--scenarios", "--env"), "--scenario"),
+}
+"""Words for options that people may think of first, and the options."""
 
 
 def advise_elsewhere(error: Exception, words: Sequence[str]) -> str:
