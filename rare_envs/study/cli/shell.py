@@ -196,6 +196,9 @@ def advise_elsewhere(error: Exception, words: Sequence[str]) -> str:
         typed = re.match("No such command '(.*?)'", getattr(error, "message", ""))
         better = ELSEWHERE.get(typed[1]) if typed else None
         return f"No such command {typed[1]!r}: it is {better}." if typed and better else ""
+    parameters = getattr(getattr(context, "command", None), "params", ())
+    if (better := SYNONYMS.get(option)) in [name for each in parameters for name in each.opts]:
+        return f"No such option {option}: it is {better}."
     key, keys = (
         option.lstrip("-").replace("-", "_"),
         _file_keys(context),
