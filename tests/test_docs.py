@@ -167,6 +167,12 @@ def test_training_on_a_page_is_seeded(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_code_and_output_of_a_page_need_no_scrolling(page: Path) -> None:
+    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    assert not [line for kind, block in fenced if kind != "math" for line in block.splitlines() if len(line) > 75]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_of_a_page(page: Path) -> None:
     for target, _, heading in re.findall(r"\]\(([^)#]*)(#([^)]*))?\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
