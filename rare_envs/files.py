@@ -48,6 +48,9 @@ def replace_file(path: str | Path) -> Iterator[Path]:
             if stat.S_ISREG(before := path.lstat().st_mode):
                 draft.chmod(before & draft.stat().st_mode)
         draft.replace(path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # which a full disk does not name
+        raise
     finally:
         draft.unlink(missing_ok=True)
     _sync(path.parent)

@@ -200,8 +200,12 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
             if not isinstance(base, FittedDistribution) or not base.refits:
                 name = "the default" if question.base is None else repr(question.base)
                 raise ValueError(f"The traffic model ({name}) has no refits, so there is no ensemble of them.")
-            if read_strata(base):
-                raise ValueError("The traffic model has strata, whose refits have no ensemble.")
+            if strata := read_strata(base):
+                names = ", ".join(each.name for each in strata)
+                raise ValueError(
+                    f"Expected a traffic model without strata for an ensemble of its refits, got one with {names}. "
+                    "Leave ensemble out: the interval of p covers the refits without it."
+                )
             base = base.ensemble()
         world = {name: getattr(question, name) for name in PROBLEM_FIELDS}
         return DrivingProblem(question.env_id, ego=ego, base=base, **world)

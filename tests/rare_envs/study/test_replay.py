@@ -13,7 +13,7 @@ from PIL import Image
 
 import rare_envs
 import samplers
-from rare_envs.study import Question, Report, prepare, run
+from rare_envs.study import Question, Report, plots, prepare, run
 from rare_envs.study.arguments import BadInput
 from rare_envs.study.plots import (
     MARKER,
@@ -27,7 +27,7 @@ from rare_envs.study.plots import (
     write_film,
 )
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, in_file
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
 
 CUT_IN, NEWEST = "rare_envs/CutIn-v0", "rare_envs/CutIn-v1"
 
@@ -69,6 +69,19 @@ def test_moments_by_hand() -> None:
     assert drive.time[len(k)] == pytest.approx(3.0, abs=0.11)
     assert drive.collided and drive.gap[-2] >= 0.0 >= drive.gap[-1] and drive.worst == len(drive.time) - 1
     np.testing.assert_allclose(drive.speed, np.tile([20.0, 10.0], (len(drive.time), 1)), atol=1e-4)
+
+
+def test_a_film_on_a_full_disk_is_one_line_and_the_film_before_it_stays(
+    cli: Cli, finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    film = tmp_path / "film.gif"
+    film.write_text("the one before")
+    monkeypatch.setattr(plots, "save_gif", full)
+    assert_refused(cli("replay", finished_run, "--out", film, "--force"), "No space left on device", str(film))
+    assert film.read_text() == "the one before" and list(tmp_path.iterdir()) == [film]
 
 
 def test_a_drive_that_comes_out_otherwise_says_why(finished_run: Path) -> None:
