@@ -87,8 +87,8 @@ def others(state: State, dt: float) -> Others:
     x, y, speed = state.x[:, 1], state.y[:, 1], state.speed[:, 1]
     after = (y - now.clamp_min(0.0) * dt).clamp_min(0.0)
     now = torch.minimum(now + LATERAL_ACCELERATION * dt, most)
-    fields = (x + speed * dt, after, torch.zeros_like(x), speed)
-    return Others(*(each[:, None] for each in fields), theta=columns(now, most))
+    x, y, heading, speed = (each[:, None] for each in (x + speed * dt, after, torch.zeros_like(x), speed))
+    return Others(x, y, heading, speed, theta=columns(now, most))
 
 
 def make_scenario() -> Scenario:

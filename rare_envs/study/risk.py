@@ -17,6 +17,7 @@ import numpy as np
 import agents
 import samplers
 from rare_envs import exposure
+from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.files import format_json, replace_text
 from rare_envs.people import HumanBenchmark
@@ -26,7 +27,7 @@ from rare_envs.scenarios.registry import env_id_of, find_scenario, split_layout
 from rare_envs.startup import __version__
 from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
-from rare_envs.study.evaluate import run, run_into
+from rare_envs.study.evaluate import COMPARISON, compare_egos, run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
@@ -468,3 +469,163 @@ def _evaluate(
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
     rate = replace(report.rate, site_log_sd=float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0)
     return ScenarioRisk(report=report, rate=rate, site_factors=factors)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RiskComparison:
+    """Collisions per million km of two egos in the same draws of several scenarios, and the ratio of their sums."""
+
+    ego_a: str
+    """Ego A, as it was named."""
+    ego_b: str
+    """Ego B."""
+    scenarios: Mapping[str, samplers.comparison.Comparison]
+    """The comparison in each scenario, by name."""
+    frequencies: Mapping[str, EventFrequency]
+    """How often the events of each scenario happen."""
+
+    @cached_property
+    def per_million_km(self) -> dict[str, float]:
+        """Collisions per million km: of A, of B, and by which egos have them in the same draws."""
+        found = dict.fromkeys(("a", "b", "both", "only_a", "only_b"), 0.0)
+        for name, pair in self.scenarios.items():
+            shares = {**pair.shares, "a": pair.a.p, "b": pair.b.p}
+            for each in found:
+                found[each] += exposure.MILLION_KM * self.frequencies[name].per_km * shares[each]
+        return found
+
+    @property
+    def ratio(self) -> float:
+        """Collisions of A over those of B; inf if B has none, NaN if neither has."""
+        a, b = self.per_million_km["a"], self.per_million_km["b"]
+        return a / b if b > 0 else math.inf if a > 0 else math.nan
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """Interval of the ratio, of the confidence of the comparisons.
+
+        From draws of B's rate in each scenario, by simulations, counts and refits, and of the ratio there, by its
+        interval with the traffic model. An ego without a failure in a scenario has 0 there for one limit of the ratio,
+        and its upper limit for the other.
+        """
+        rng, n, ends = np.random.default_rng(0), exposure.RATE_DRAWS, np.zeros((2, 2, exposure.RATE_DRAWS))
+        for name, pair in self.scenarios.items():
+            z, per_km = exposure.normal_quantile(pair.confidence), self.frequencies[name].per_km
+            known = pair.base_uncertainty
+            spread = 0.0 if known is None or not math.isfinite(known.spread) else known.spread
+            common = math.hypot(self.frequencies[name].log_sd, spread) * rng.standard_normal(n)
+            if pair.a.p > 0 and pair.b.p > 0:
+                low, high = pair.interval if known is None or known.interval is None else known.interval
+                error = rng.standard_normal(n)
+                away = np.where(error < 0, math.log(pair.ratio / max(low, 1e-300)), math.log(high / pair.ratio))
+                b = per_km * pair.b.p * np.exp(common + pair.b.cov * rng.standard_normal(n))
+                ends[0] += b * pair.ratio * np.exp(away / z * error)
+                ends[1] += b
+                continue
+            for side, own in enumerate((pair.a, pair.b)):
+                drawn = own.p * np.exp((own.cov if own.p > 0 else 0.0) * rng.standard_normal(n))
+                least, most = (0.0, own.interval[1]) if own.p == 0 else (drawn, drawn)
+                ends[side] += per_km * np.exp(common) * np.stack((least + np.zeros(n), most + np.zeros(n)))
+        if not ends[:, 1].any():
+            return 0.0, math.inf
+        tails = exposure.tail_levels(next(iter(self.scenarios.values())).confidence)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            low, high = ends[0, 0] / ends[1, 1], np.where(ends[1, 0] > 0, ends[0, 1] / ends[1, 0], math.inf)
+        return float(np.quantile(low, tails[0])), float(np.quantile(high, tails[1], method="inverted_cdf"))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts, by scenario."""
+        named = ((text.name_scenario(name), pair.warnings) for name, pair in self.scenarios.items())
+        return tuple(f"{name}: {warning}" for name, warnings in named for warning in warnings)
+
+    def __str__(self) -> str:
+        """Return the answer, for people: both rates, their ratio, and which egos fail in the same draws."""
+        rates, (low, high) = self.per_million_km, map(text.format_rate, self.interval)
+        rows = [("per million km", "A", "B", "both", "only A", "only B")]
+        for name, pair in self.scenarios.items():
+            alone = replace(self, scenarios={name: pair})
+            rows.append((text.name_scenario(name), *map(text.format_rate, alone.per_million_km.values())))
+        if len(self.scenarios) > 1:
+            rows.append(("all", *map(text.format_rate, rates.values())))
+        level = f"{100 * next(iter(self.scenarios.values())).confidence:g} %"
+        ratio = f"{text.format_rate(self.ratio)} ({level}: {low} to {high})".replace("inf", "unlimited")
+        ratio = "not known, as neither failed" if math.isnan(self.ratio) else ratio
+        first = f"A = {self.ego_a}, B = {self.ego_b}: collisions of A / B {ratio}"
+        return "\n".join([first, *text.tabulate(rows), *(f"warning: {each}" for each in self.warnings)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON; infinities and NaN become None."""
+        ends = (*self.interval, self.ratio)
+        low, high, ratio = (end if math.isfinite(end) else None for end in ends)
+        return {
+            "ego_a": self.ego_a,
+            "ego_b": self.ego_b,
+            "ratio": ratio,
+            "interval": [low, high],
+            "per_million_km": dict(self.per_million_km),
+            "scenarios": {name: pair.to_dict() for name, pair in self.scenarios.items()},
+            "warnings": list(self.warnings),
+            "text": str(self).splitlines(),
+            "version": __version__,
+        }
+
+
+def compare_risks(
+    ego_a: str,
+    ego_b: str,
+    *,
+    scenarios: Sequence[str] = SCENARIO_SET,
+    site: str = "us101",
+    bases: Mapping[str, str | PathLike[str]] | None = None,
+    out: str | PathLike[str] | None = None,
+    progress: bool = False,
+    force: bool = False,
+    algo_b: str | None = None,
+    stats_b: str | None = None,
+    executor: Executor | None = None,
+    **options: Any,
+) -> RiskComparison:
+    """Compare two egos, such as a policy and "cc_human", in the same draws of the scenarios of `risk`.
+
+    Args:
+        ego_a: Name, file or address of ego A.
+        ego_b: The same of ego B; `algo_b` and `stats_b` belong to its .zip.
+        scenarios: Scenarios that count nothing twice, as of `risk`.
+        site: Site of the bases.
+        bases: Base distributions by scenario, in place of those of the site.
+        out: Folder for comparison.json and a folder of each scenario, which `rare-envs resume` continues.
+        progress: Show a bar on standard error.
+        force: Replace what the folder has.
+        algo_b: As `Question.algo`, of ego B.
+        stats_b: As `Question.stats`, of ego B.
+        executor: As of `samplers.estimate`.
+        **options: Further fields of `rare_envs.study.Question`; max_sim is of each scenario.
+
+    Raises:
+        BadInput: An argument cannot be used, or an ego does not fit a scenario.
+        RunInterrupted: It was interrupted.
+
+    Example:
+        >>> from rare_envs.study.risk import compare_risks
+        >>> found = compare_risks("idm", "rss", scenarios=["car_following"], method="mc", max_sim=200, seed=0)
+        >>> found.per_million_km["a"], found.ratio
+        (0.0, nan)
+    """
+    folder = None if out is None else Path(out)
+    with as_bad_input(TypeError, ValueError):
+        chosen = _choose_scenarios(scenarios, [site], bases or {})
+        asked = [Question(env_id=env_id, base=base, ego=ego_a, **options) for env_id, base in chosen.values()]
+        frequencies = {name: find_frequency(prepare(each)) for name, each in zip(chosen, asked, strict=True)}
+    with contextlib.nullcontext() if folder is None else output_folder(folder, COMPARISON, folders=chosen):
+        if folder is not None and not force:
+            check_no_results(folder, COMPARISON)
+        pairs = {}
+        for name, question in zip(chosen, asked, strict=True):
+            part = None if folder is None else folder / name
+            pairs[name], _ = compare_egos(question, ego_b, progress, part, force, algo_b, stats_b, executor)
+        found = RiskComparison(ego_a=ego_a, ego_b=ego_b, scenarios=pairs, frequencies=frequencies)
+        if folder is not None:
+            with unwritten_results(folder, found):
+                replace_text(folder / COMPARISON, format_json(found.to_dict()) + "\n")
+    return found

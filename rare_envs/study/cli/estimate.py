@@ -324,26 +324,43 @@ def compare_command(
     ego_a: Annotated[str, Argument(metavar="EGO_A", help="Policy A, the one before, as for estimate --ego.")],
     ego_b: Annotated[str, Argument(metavar="EGO_B", help="Policy B, the new one.")],
     asked: dict[str, Any],
-    env: Annotated[str | None, Argument(metavar="SCENARIO", help="Scenario, as for estimate.")] = None,
+    env: Annotated[str | None, Argument(metavar="SCENARIO", help="Scenario; those of risk by default.")] = None,
     algo_b: str | None = None,
     stats_b: str | None = None,
     out: Annotated[Path | None, Option(help="Folder for comparison.json and failures.csv.")] = None,
     force: shell.ForceOption = False,
     details: shell.DetailsOption = False,
 ) -> Answer:
-    """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
+    """Estimate how many times likelier ego A fails than ego B, in a scenario or summed over those of risk."""
     from rare_envs.study.evaluate import compare_egos
 
     env = env or asked.pop("env_id")
     if env is None:
-        raise BadInput(
-            "Expected a scenario: rare-envs compare EGO_A EGO_B CutIn, or env: CutIn in the file of --config."
-        )
+        return _compare_risks(ego_a, ego_b, {**asked, "algo_b": algo_b, "stats_b": stats_b}, out, force)
     question, executor = _ask(env, {**asked, "max_sim": asked["max_sim"] or PAIR_SIMULATIONS}, ego=ego_a)
     tell, b = partial(_tell_comparison, details), {"algo_b": algo_b, "stats_b": stats_b}
     with shell.telling_unwritten(tuple, tell):
         pair = compare_egos(question, ego_b, progress=True, out=out, force=force, executor=executor, **b)
     return tell(pair, out)
+
+
+def _compare_risks(ego_a: str, ego_b: str, asked: dict[str, Any], out: Path | None, force: bool) -> Answer:
+    """Compare two egos in the scenarios of risk."""
+    from rare_envs.study.risk import SCENARIO_SET, RiskComparison, compare_risks
+
+    if asked["max_ratio"] is not None:
+        raise BadInput("Expected a scenario with --max-ratio: rare-envs compare EGO_A EGO_B CutIn --max-ratio 1.")
+    executor, base = _make_executor(asked), asked.pop("base")
+    options = {name: value for name, value in asked.items() if name not in (*shell.EXECUTOR, "env_id")}
+    options |= {"bases": _read_bases([base] if base else [], SCENARIO_SET)}
+    options |= {"max_sim": asked["max_sim"] or PAIR_SIMULATIONS, "executor": executor}
+
+    def tell(found: Any, *wrote: str) -> Answer:
+        return Answer(found.to_dict(), "\n".join([str(found), *wrote]), DOUBTFUL if found.warnings else 0)
+
+    with as_bad_input(ValueError), shell.telling_unwritten(RiskComparison, tell):
+        found = compare_risks(ego_a, ego_b, out=out, progress=True, force=force, **options)
+    return tell(found, *([] if out is None else [f"Wrote {out}."]))
 
 
 def _tell_comparison(details: bool, pair: tuple[Comparison, dict[str, Any]], out: Path | None = None) -> Answer:

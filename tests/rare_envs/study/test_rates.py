@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +27,7 @@ from rare_envs.simulation.observation import observation_space
 from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.events import EventRate, list_part_errors, sum_people
 from rare_envs.study.report import describe_left_out, find_frequency
-from rare_envs.study.risk import compare_sites
+from rare_envs.study.risk import RiskComparison, compare_sites
 from rare_envs.study.text import describe_calibration, format_rate, format_with_interval, tabulate_events
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
 
@@ -344,3 +347,62 @@ def test_the_scenarios_that_a_policy_fits_are_run(bases: dict[str, str], monkeyp
     with pytest.raises(BadInput, match=r"fits none of the scenarios cut-in, hard brake\. .*101") as refused:
         rare_envs.risk(stranger, bases=bases, method="mc", max_sim=40)
     assert "\n" not in str(refused.value)
+
+
+def count_failures(a: Sequence[int], b: Sequence[int]) -> samplers.comparison.Comparison:
+    """Compare two functions that fail at these of 100 draws."""
+
+    def picks(hits: Sequence[int]) -> samplers.FunctionProblem:
+        seen: dict[float, int] = {}
+
+        def f(x: Any) -> Any:
+            ranks = [seen.setdefault(float(value), len(seen)) for value in x[:, 0]]
+            return np.where(np.isin(ranks, hits), -1.0, 1.0)
+
+        return samplers.FunctionProblem(f, 1)
+
+    return samplers.compare(picks(a), picks(b), "mc", seed=0, max_sim=200)
+
+
+def add_up(**pairs: tuple[Sequence[int], Sequence[int]]) -> RiskComparison:
+    """Return two egos in scenarios of which one happens each km."""
+    counted = EventFrequency(count=1000, hours=10.0, km=1000.0, definition="events", source="made up")
+    found = {name: count_failures(*hits) for name, hits in pairs.items()}
+    return RiskComparison(ego_a="a", ego_b="b", scenarios=found, frequencies=dict.fromkeys(pairs, counted))
+
+
+def test_two_egos_are_compared_by_their_sums_over_scenarios() -> None:
+    """Four and two failures of 100, one of them of both, and in the other scenario two of B: 4 / 4 per 100 km."""
+    found = add_up(cut_in=([0, 1, 2, 3], [0, 4]), hard_brake=([], [7, 8]))
+    assert found.per_million_km == pytest.approx({"a": 4e4, "b": 4e4, "both": 1e4, "only_a": 3e4, "only_b": 3e4})
+    low, high = found.interval
+    assert found.ratio == pytest.approx(1.0)
+    assert low < 1.0 < high
+    alone = add_up(cut_in=([0, 1, 2, 3], [0, 4]))
+    assert alone.interval == pytest.approx(alone.scenarios["cut_in"].interval, rel=0.1)
+    row = next(line.split() for line in str(found).splitlines() if line.startswith("all "))
+    assert row == ["all", "40,000", "40,000", "10,000", "30,000", "30,000"]
+
+
+def test_without_failures_of_one_ego_the_ratio_of_sums_has_one_limit() -> None:
+    never, hits = (), tuple(range(30))
+    above, below, neither = (add_up(cut_in=pair) for pair in ((hits, never), (never, hits), (never, never)))
+    assert above.ratio == above.interval[1] == float("inf")
+    assert above.interval[0] > 4.0
+    assert below.ratio == below.interval[0] == 0.0
+    assert below.interval[1] == pytest.approx(1.0 / above.interval[0], rel=0.1)
+    assert neither.interval == (0.0, float("inf"))
+    assert "not known, as neither failed" in str(neither)
+    assert above.to_dict()["ratio"] is neither.to_dict()["ratio"] is None
+
+
+def test_compare_without_a_scenario_sums_over_those_of_risk(cli: Any, tmp_path: Path) -> None:
+    words = ("compare", "idm", "cc_human", "--method", "mc", "--max-sim", 200, "--seed", 0)
+    done = cli(*words, "--out", tmp_path / "pair", "--json")
+    assert done.exit_code == 3, done.stderr
+    found = json.loads(done.stdout)
+    assert found == json.loads((tmp_path / "pair" / "comparison.json").read_text())
+    assert list(found["scenarios"]) == ["cut_in", "hard_brake"]
+    assert found["scenarios"]["cut_in"]["shares"]["neither"] == 1.0
+    assert "finished run" in cli(*words, "--out", tmp_path / "pair").stderr
+    assert "Expected a scenario with --max-ratio" in cli(*words, "--max-ratio", 1).stderr
