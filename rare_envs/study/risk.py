@@ -27,12 +27,12 @@ from rare_envs.scenarios.registry import env_id_of, find_scenario, split_layout
 from rare_envs.startup import __version__
 from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
-from rare_envs.study.evaluate import COMPARISON, compare_egos, run, run_into
+from rare_envs.study.evaluate import compare_egos, run, run_into
 from rare_envs.study.events import EventRate, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
-from rare_envs.study.run_folder import JOURNAL, RISK
+from rare_envs.study.run_folder import COMPARISON, JOURNAL, RISK
 from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
 from samplers.evaluate import Executor
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
@@ -471,6 +471,10 @@ def _evaluate(
     return ScenarioRisk(report=report, rate=rate, site_factors=factors)
 
 
+LEAST = 1e-300
+"""Floor of a ratio whose logarithm is taken."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RiskComparison:
     """Collisions per million km of two egos in the same draws of several scenarios, and the ratio of their sums."""
@@ -508,30 +512,32 @@ class RiskComparison:
         interval with the traffic model. An ego without a failure in a scenario has 0 there for one limit of the ratio,
         and its upper limit for the other.
         """
-        rng, n, ends = np.random.default_rng(0), exposure.RATE_DRAWS, np.zeros((2, 2, exposure.RATE_DRAWS))
+        rng, n = np.random.default_rng(0), exposure.RATE_DRAWS
+        ends = np.zeros((2, 2, n))  # of A and of B, the least and the most of each draw
         for name, pair in self.scenarios.items():
             z, per_km = exposure.normal_quantile(pair.confidence), self.frequencies[name].per_km
             known = pair.base_uncertainty
             spread = 0.0 if known is None or not math.isfinite(known.spread) else known.spread
-            common = math.hypot(self.frequencies[name].log_sd, spread) * rng.standard_normal(n)
+            common = per_km * np.exp(math.hypot(self.frequencies[name].log_sd, spread) * rng.standard_normal(n))
+            a, b = (
+                common * side.p * np.exp((side.cov if side.p > 0 else 0.0) * rng.standard_normal(n))
+                for side in (pair.a, pair.b)
+            )
+            low, high = pair.interval if known is None or known.interval is None else known.interval
             if pair.a.p > 0 and pair.b.p > 0:
-                low, high = pair.interval if known is None or known.interval is None else known.interval
                 error = rng.standard_normal(n)
-                away = np.where(error < 0, math.log(pair.ratio / max(low, 1e-300)), math.log(high / pair.ratio))
-                b = per_km * pair.b.p * np.exp(common + pair.b.cov * rng.standard_normal(n))
-                ends[0] += b * pair.ratio * np.exp(away / z * error)
-                ends[1] += b
-                continue
-            for side, own in enumerate((pair.a, pair.b)):
-                drawn = own.p * np.exp((own.cov if own.p > 0 else 0.0) * rng.standard_normal(n))
-                least, most = (0.0, own.interval[1]) if own.p == 0 else (drawn, drawn)
-                ends[side] += per_km * np.exp(common) * np.stack((least + np.zeros(n), most + np.zeros(n)))
+                away = np.where(error < 0, math.log(pair.ratio / max(low, LEAST)), math.log(high / pair.ratio))
+                a = b * pair.ratio * np.exp(away / z * error)
+            most_a = common * pair.a.interval[1] if pair.b.p == 0 else b * high
+            most_b = common * pair.b.interval[1] if pair.a.p == 0 else a / max(low, LEAST)
+            ends[0] += np.stack((a, a if pair.a.p > 0 else most_a))
+            ends[1] += np.stack((b, b if pair.b.p > 0 else most_b))
         if not ends[:, 1].any():
             return 0.0, math.inf
         tails = exposure.tail_levels(next(iter(self.scenarios.values())).confidence)
         with np.errstate(divide="ignore", invalid="ignore"):
-            low, high = ends[0, 0] / ends[1, 1], np.where(ends[1, 0] > 0, ends[0, 1] / ends[1, 0], math.inf)
-        return float(np.quantile(low, tails[0])), float(np.quantile(high, tails[1], method="inverted_cdf"))
+            least, most = ends[0, 0] / ends[1, 1], np.where(ends[1, 0] > 0, ends[0, 1] / ends[1, 0], math.inf)
+        return float(np.quantile(least, tails[0])), float(np.quantile(most, tails[1], method="inverted_cdf"))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -542,7 +548,7 @@ class RiskComparison:
     def __str__(self) -> str:
         """Return the answer, for people: both rates, their ratio, and which egos fail in the same draws."""
         rates, (low, high) = self.per_million_km, map(text.format_rate, self.interval)
-        rows = [("per million km", "A", "B", "both", "only A", "only B")]
+        rows: list[tuple[str, ...]] = [("per million km", "A", "B", "both", "only A", "only B")]
         for name, pair in self.scenarios.items():
             alone = replace(self, scenarios={name: pair})
             rows.append((text.name_scenario(name), *map(text.format_rate, alone.per_million_km.values())))
@@ -613,13 +619,13 @@ def compare_risks(
         (0.0, nan)
     """
     folder = None if out is None else Path(out)
+    if folder is not None and not force:
+        check_no_results(folder, COMPARISON)
     with as_bad_input(TypeError, ValueError):
         chosen = _choose_scenarios(scenarios, [site], bases or {})
         asked = [Question(env_id=env_id, base=base, ego=ego_a, **options) for env_id, base in chosen.values()]
         frequencies = {name: find_frequency(prepare(each)) for name, each in zip(chosen, asked, strict=True)}
     with contextlib.nullcontext() if folder is None else output_folder(folder, COMPARISON, folders=chosen):
-        if folder is not None and not force:
-            check_no_results(folder, COMPARISON)
         pairs = {}
         for name, question in zip(chosen, asked, strict=True):
             part = None if folder is None else folder / name
