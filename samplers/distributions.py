@@ -24,15 +24,7 @@ from samplers.components import expectation_maximisation, one_hot, posterior
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, needs_library
 from samplers.proposals import Mixture, move_gaussian
 
-__all__ = [
-    "BetaBlock",
-    "Distribution",
-    "GaussianBlock",
-    "MixtureBlock",
-    "NormalBlock",
-    "Product",
-    "StandardNormal",
-]
+__all__ = ["BetaBlock", "Distribution", "GaussianBlock", "MixtureBlock", "NormalBlock", "Product", "StandardNormal"]
 
 
 def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:

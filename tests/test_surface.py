@@ -231,16 +231,11 @@ def test_estimate_takes_its_arguments_and_fills_an_estimate() -> None:
 
 def test_a_sum_of_strata_is_estimated_with_its_parts() -> None:
     looked, unseen = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 1.0))
-    strata = (
-        Stratum("looked", 0.99, looked),
-        Stratum("unseen", 0.01, unseen, log_sd=0.5),
-    )
+    strata = Stratum("looked", 0.99, looked), Stratum("unseen", 0.01, unseen, log_sd=0.5)
     result = samplers.estimate(StratifiedProblem(strata), "mc", seed=0, max_sim=20_000)
     assert [part.name for part in result.parts] == ["looked", "unseen"] and result.base_uncertainty is not None
-    assert (
-        isinstance(result.parts[0], samplers.methods.Part)
-        and result.parts[1].interval[0] < 0.159 < result.parts[1].interval[1]
-    )
+    low, high = result.parts[1].interval
+    assert isinstance(result.parts[0], samplers.methods.Part) and low < 0.159 < high
 
 
 def test_samplers_need_no_torch() -> None:

@@ -442,9 +442,7 @@ class Report:
             "modes": [mode.to_dict() for mode in self.kinds.modes],
             "curve": convert(self.curve),
             "severity": convert(self.kinds.severity),
-            "sensitivity": self.sensitivity.to_dict()
-            if isinstance(self.sensitivity, samplers.analysis.Sensitivity)
-            else None,
+            "sensitivity": None if isinstance(self.sensitivity, str | None) else self.sensitivity.to_dict(),
             "failures": [
                 {
                     "parameters": self._parameters(one.x),

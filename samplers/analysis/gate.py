@@ -245,7 +245,7 @@ def plan(pilot: Any, target_cov: float) -> tuple[PlannedRun, ...]:
         [('two-stage', 12000, 24.0), ('mc', 99990000, 199980.0)]
     """
     if not isinstance(pilot, Pilot):
-        if not callable(getattr(pilot, "pilot", None)):
+        if isinstance(pilot, type) or not callable(getattr(pilot, "pilot", None)):
             raise ValueError(f"Expected the result of samplers.estimate, or its pilot(), got {type(pilot).__name__}.")
         pilot = pilot.pilot()
     check_number("target_cov", target_cov, 0.0, math.inf)

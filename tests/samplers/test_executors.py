@@ -339,9 +339,7 @@ def test_a_chunk_that_nobody_waits_for_is_cancelled_and_no_two_calls_are_alike(m
     monkeypatch.setattr(executors, "QUIET_SECONDS", 0.01)
     waiting = Waiting()
     with pytest.warns(RuntimeWarning, match="has come back"):
-        with pytest.raises(
-            executors.ExecutorError, match=r"No worker has computed anything: no answer within 0\.001 s"
-        ):
+        with pytest.raises(executors.ExecutorError, match=r"No worker .* anything: no answer within 0\.001 s"):
             estimate(problem(matrix), FuturesPool(waiting, workers=1, time_limit=0.001), 1)
     assert len(waiting.jobs) == 3 and all(job.cancelled() for job in waiting.jobs)
     (*first, call), (*again, other), _ = waiting.calls

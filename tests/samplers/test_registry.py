@@ -48,7 +48,7 @@ LATTICE = """
 
     class Sized(Lattice):
         def __init__(self, n):
-            object.__setattr__(self, "n", n)
+            super().__init__(n)
 
 
     NUMBER, SMALL = 3, Lattice(n=50)
