@@ -315,7 +315,7 @@ def test_a_chunk_goes_three_times_then_its_rows_and_good_neighbours_are_not_blam
     lossy = Lossy()
     result = estimate(problem(chunk_size=10), FuturesPool(lossy, workers=2), 60)
     assert "1 simulations gave no outcome" in " ".join(result.warnings)
-    assert "No worker survived 1 rows; of the first: ArithmeticError: the pool is broken." in result.remarks
+    assert "No worker survived 1 rows; the first of them: ArithmeticError: the pool is broken." in result.remarks
     assert 9 + 3 <= lossy.sizes.count(1) <= 9 + 3 + 6  # with rows that were in flight beside the bad one
     assert lossy.sizes.count(10) < 5 + 3 + 5
 
