@@ -238,7 +238,7 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     base = scenario.default_base if base is None else base
     found: Any = scenario.bases.get(str(base), Path(base)) if isinstance(base, str | PathLike) else base
     if isinstance(found, Path) and names_object(str(base)) and not found.exists():
-        found = make_object(str(base), "base distribution")
+        found = make_object(str(base), "traffic model")
     where = (scenario.name, tuple(p.name for p in scenario.parameters), str(base))
     if isinstance(found, Mapping):
         box = scenario.column_parameters

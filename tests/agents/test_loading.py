@@ -149,10 +149,10 @@ def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str, tm
         ("mak", r"has nothing called 'mak' \(did you mean 'make'\?\)\."),
         ("zzz", r"has nothing called 'zzz'\."),
         ("make_nothing", r"predict\(observation, \.\.\.\), got NoneType from 'own_egos_for_test:make_nothing'"),
-        ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
-        ("make_exit", "failed to make an ego: SystemExit: 7"),
+        ("make_trouble", "failed to make the ego: RuntimeError: no weights"),
+        ("make_exit", "failed to make the ego: SystemExit: 7"),
         ("make_array", "got ndarray from"),
-        ("drive", "called without arguments, failed to make an ego: TypeError: .*missing 1 required .*'observation'"),
+        ("drive", "called without arguments, failed to make the ego: TypeError: .*missing 1 required .*'observation'"),
     ):
         with pytest.raises(ValueError, match=message) as caught:
             load_ego(f"{own_module}:{function}")
