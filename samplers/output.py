@@ -264,7 +264,7 @@ FACTS: Mapping[str, str] = MappingProxyType(
         "calibrated": "human driver model {model}, within a factor of {factor} of people's interval",
         "not calibrated": "not calibrated: human driver model {model}, {far}",
         "not measured": "not calibrated: human driver model not measured in {traffic}",
-        "crash": "{contact}, {speed} m/s at contact, delta-v {delta_v} m/s",
+        "crash": "{contact}, {speed} m/s relative, delta-v {delta_v} m/s",
         "avoids": "{driver} avoids {share} of these",
         "likeliest": "{kinds}; most likely: {what}",
         "usual": "all parameters in their usual range",

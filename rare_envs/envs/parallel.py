@@ -145,11 +145,10 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
     @property
     def state_space(self) -> "spaces.Box[np.float32]":
-        """Space of `state`: any finite numbers, shape (N, 4), speeds not negative."""
-        most = float(np.finfo(np.float32).max)
-        low = np.full((self.world.scenario.vehicles, 4), -most, dtype=np.float32)
+        """Space of `state`: any numbers, shape (N, 4), speeds not negative."""
+        low = np.full((self.world.scenario.vehicles, 4), -np.inf, dtype=np.float32)
         low[:, 3] = 0.0
-        return spaces.Box(low, most, dtype=np.float32)
+        return spaces.Box(low, np.inf, dtype=np.float32)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -327,6 +327,11 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
             f"Expected policy_frequency above 0 and at most simulation_frequency, got {decided!r} and {simulated!r}: "
             "HighwayEnv would simulate no step from one decision to the next, so that nothing moves."
         )
+    if simulated % decided:
+        raise ValueError(
+            f"Expected simulation_frequency as a multiple of policy_frequency, got {simulated} and {decided}: "
+            "HighwayEnv would simulate less time than a step lasts."
+        )
     return LAYOUTS[known]
 
 

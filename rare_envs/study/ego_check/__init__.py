@@ -48,7 +48,11 @@ def exit_code(findings: list[Finding]) -> int:
 
 
 def print_findings(findings: list[Finding], title: str, everything: bool = False) -> None:
-    """Print findings with their remedies, and the verdict."""
+    """Print findings with their remedies, and the verdict; one line if all passed and not everything is asked for."""
+    console = CleanConsole(highlight=False, markup=False)
+    if not everything and all(each.status == "pass" for each in findings):
+        console.print(f"{title} can be used: {len(findings)} checks passed (details: --all)")
+        return
     table = Table("check", "", "found", "what to do", title=title, title_justify="left", title_style="bold")
     passed = []
     for each in findings:
@@ -60,6 +64,5 @@ def print_findings(findings: list[Finding], title: str, everything: bool = False
     if passed:
         count = f"{len(passed)} other{'s' if len(passed) > 1 else ''}"
         table.add_row(count, Text("pass", style=STYLES["pass"]), ", ".join(passed), "")
-    console = CleanConsole(highlight=False, markup=False)
     console.print(table)
     console.print(VERDICTS[exit_code(findings)])

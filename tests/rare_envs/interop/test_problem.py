@@ -108,6 +108,7 @@ def test_bad_input_is_refused_at_the_door() -> None:
         ({"observation": "Kinematics"}, "HighwayEnv makes no highway-fast-v0 of the config .*: TypeError"),
         ({"manual_control": True}, "would not carry out the actions"),
         ({"policy_frequency": 6}, "policy_frequency above 0 and at most simulation_frequency, got 6 and 5"),
+        ({"policy_frequency": 2}, "simulation_frequency as a multiple of policy_frequency, got 5 and 2"),
         ({"policy_frequency": -1}, "at most simulation_frequency, got -1 and 5: .* nothing moves"),
     ]
     for config, message in configs:

@@ -321,3 +321,9 @@ def test_a_server_that_keeps_to_the_protocol_passes() -> None:
     assert worse["another step"].status == worse["no reset"].status == "fail"
     nobody = findings(f"{server.address}?timeout=0.3&patience=0.3")
     assert "is it running" in nobody["protocol"].advice
+
+
+def test_a_check_without_a_finding_is_one_line(cli: Cli) -> None:
+    said = cli("check-ego", "idm", "CutIn").stdout
+    assert said == "idm in rare_envs/CutIn-v1 can be used: 2 checks passed (details: --all)\n"
+    assert "driving" in cli("check-ego", "idm", "CutIn", "--all").stdout
