@@ -1,9 +1,13 @@
-"""The ego `imitation`: a driver learned from recorded people and encounters.
+"""The ego `imitation`, learned from recorded people and encounters, and the drivers of the traffic `gail` and `mgail`.
 
     python -m training.recipes.imitation --data TABLES --out runs/imitation
+    python -m training.recipes.imitation --driver mgail --data TABLES --out runs/mgail
 
-It is trained as the drivers of the traffic are (`training.imitation`): likelihood and critic use recorded people only,
-and the gradient goes through the simulator. Two things differ. Beside recorded scenes it drives encounters: draws of
+`gail` and `mgail` are trained on US 101, each with the distribution of its last layer's weights. The rules beside the
+network of the shipped `mgail` are settings of `agents.load_driver`.
+
+`imitation` is trained as these are (`training.imitation`): likelihood and critic use recorded people only, and the
+gradient goes through the simulator. Two things differ. Beside recorded scenes it drives encounters: draws of
 this project's scenarios, which the others replay, many behind each other on one road. And its loss has penalties on
 following closely, leaving the middle of the lane and speeding.
 
@@ -17,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -46,8 +50,10 @@ from training.imitation.train import (
     driver_of,
     load_scenes,
     make_learner,
+    train_driver,
     train_learner,
 )
+from training.imitation.weights import Ensemble, make_ensemble
 from training.recipes.ordinary_traffic import CASES, draw_inputs, judge_all_cases, make_world
 
 FloatArray = NDArray[np.float64]
@@ -64,6 +70,11 @@ CONFIG = Config(
     lane_weight=8.0,
     speed_weight=8.0,
 )
+DRIVER_CONFIGS = {
+    "gail": Config(method="gail", updates=1100, horizon=(40, 40), critic_weight=4.5, brake_weight=2.0),
+    "mgail": Config(method="mgail", updates=1500),
+}
+ENSEMBLES = {"gail": Ensemble(members=32, updates=30), "mgail": Ensemble(members=32, updates=60)}
 RECORDED = 0.4
 """Share of recorded ones among the scenes that are driven."""
 APART, SCENE_VEHICLES = 1500.0, 39
@@ -157,9 +168,18 @@ def prepare_learner(scenes: Sequence[TrafficScene], kinds: Sequence[EncounterSpe
 def main(
     out: RunFolderOption,
     data: Annotated[Path, typer.Option(help="Folder with the compact tables of US 101.")],
-    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = 0,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same weights, of imitation.")] = 0,
+    driver_name: Annotated[
+        Literal["imitation", "gail", "mgail"], typer.Option("--driver", help="Which one.")
+    ] = "imitation",
 ) -> None:
-    """Train the ego `imitation`."""
+    """Train the ego `imitation`, or a driver of the traffic and an ensemble around it."""
+    if driver_name != "imitation":
+        with report_errors("drivers"):
+            train_driver(Source("data", data), DRIVER_CONFIGS[driver_name], out, progress=True)
+            path = make_ensemble(out, ENSEMBLES[driver_name], out / f"{driver_name}.safetensors", progress=True)
+        print(f"Saved {path}.")
+        return
     config, source = replace(CONFIG, seed=seed), Source("data", data)
     with report_errors("imitation"):
         with claim_folder(out, source, config):
