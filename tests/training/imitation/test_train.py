@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import json
 import sys
 from pathlib import Path
 
@@ -119,6 +120,14 @@ def test_a_command_repeats_its_training_and_says_what_is_missing(monkeypatch, tm
         assert result.exit_code == 0, result.output
         source, settings, _, how = found.pop()
         assert (source, settings, how["device"]) == (Source("data", Path("tables")), config, device)
+
+
+def test_every_setting_has_help_and_json_is_one_object(monkeypatch, tmp_path):
+    monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: print("progress") or tmp_path / "it")
+    result = run(["--data", "tables", "--method", "gail", "--updates", "7", "--json", "--out", str(tmp_path)])
+    assert json.loads(result.stdout) == {"driver": str(tmp_path / "it"), "method": "gail", "seed": 0}
+    parameters = inspect.signature(command_line.main).parameters
+    assert not [name for name in parameters if not parameters[name].annotation.__metadata__[0].help]
 
 
 def test_logs_go_to_tensorboard(data, tmp_path, monkeypatch):

@@ -89,6 +89,14 @@ def test_one_kind_is_explained_alone(cli: Cli) -> None:
     assert list(json.loads(cli("list", "environments", "--json").stdout)) == ["environments", "highway_env"]
 
 
+def test_traffic_models_are_listed_in_short_lines(cli: Cli) -> None:
+    shown = {spelling: cli("list", spelling).stdout for spelling in ("CutIn", "cut-in", "rare_envs/CutIn-v1")}
+    assert len(set(shown.values())) == 1 and "\nus101 (default)\n" in shown["CutIn"]
+    everything = cli("list", "bases").stdout
+    assert all(f"Traffic models of {env_id}\n" in everything for env_id in SCENARIOS)
+    assert max(map(len, (everything + shown["CutIn"]).splitlines())) < 100
+
+
 def test_bases_tell_events_site_fit_and_frequency(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     bases = {
         "us101": fitted_entries("hard_brake"),
@@ -209,6 +217,14 @@ def test_a_failure_of_a_run_is_shown(cli: Cli, run: Path, tmp_path: Path) -> Non
         "worst.png",
     ):
         assert said in words
+
+
+def test_a_kind_of_crash_is_shown_by_its_number(cli: Cli, run: Path) -> None:
+    (mode,) = json.loads((run / "result.json").read_text())["modes"]
+    assert json.loads(cli("replay", run, "--mode", 1, "--json").stdout)["failure"] == mode["failure"]
+    assert json.loads(cli("export", run, "a.xosc", "--mode", 1, "--json").stdout)["failure"] == mode["failure"]
+    assert_refused(cli("replay", run, "--mode", 2), "Expected --mode from 1 to 1, got 2")
+    assert_refused(cli("replay", run, "--mode", 1, "--failure", 0), "--failure or --mode, not both")
 
 
 def test_all_failures_replay_and_another_ego_takes_them(cli: Cli, run: Path) -> None:

@@ -20,7 +20,8 @@ from stable_baselines3 import DQN
 import agents
 import rare_envs
 import samplers
-from rare_envs.study.arguments import GATE_CODES, ExecutorOptions
+from rare_envs.interop.problem import HighwayEnvProblem
+from rare_envs.study.arguments import GATE_CODES, KEYS, ExecutorOptions
 from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.estimate import ESTIMATE_FILE
 from rare_envs.study.run_folder import CRASH, read_failures
@@ -162,6 +163,95 @@ def test_summaries_are_whole_and_no_line_is_wider_than_the_terminal(cli: Cli, mo
         assert max(map(len, shown.splitlines())) <= 80
         assert "...\n" not in shown.partition("Commands:")[2]
     assert "and show its most likely failure." in " ".join(cli("--help").stdout.split())
+
+
+ALIKE = "base drivers observation action method max-sim confidence seed assume-traffic workers config trust out force"
+"""Options of `estimate`, `risk` and `compare`."""
+
+
+COMMANDS = "list train-ego check-ego estimate risk compare resume fit report replay export corpus".split()
+
+
+def test_help_is_in_sections_as_wide_as_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    pages, listed = dict[str, str](), dict[str, list[str]]()
+    assert sorted(dict(commands(typer.main.get_command(app)))) == sorted([*COMMANDS, "corpus add", "corpus run"])
+    for name in COMMANDS:
+        with pytest.raises(SystemExit):
+            app([name, "--help"], prog_name="rare-envs")
+        pages[name] = capsys.readouterr().out
+        listed[name] = re.findall(r"(?m)^  (--[\w-]+)", pages[name])
+    assert max(map(len, listed.values())) == len(listed["estimate"]) <= 24
+    assert 100 < max(map(len, pages["estimate"].splitlines())) <= 120
+    for title in ("Ego and scenario", "Question", "Precision and budget", "Gate", "Run", "Output"):
+        assert f"\n{title}:\n" in pages["estimate"]
+    for name in ("estimate", "risk", "compare"):
+        assert {f"--{word}" for word in f"{ALIKE} details json".split()} <= {*listed[name]}
+    told = " ".join(pages["estimate"].split()).partition("further settings: ")[2].partition(". --")[0].split(", ")
+    options = {option.removeprefix("--").replace("-", "_") for option in listed["estimate"]}
+    assert {*KEYS} == (options & {*KEYS}) | {*told} | {"max_ratio"} and not options & {*told}
+
+
+def test_a_confidence_is_that_of_the_interval(cli: Cli, risky: str) -> None:
+    found = [json.loads(cli(*SMALL, "--base", risky, "--confidence", c, "--json").stdout) for c in (0.8, 0.99)]
+    (low, high), (wider_low, wider_high) = (each["interval"] for each in found)
+    assert [each["confidence"] for each in found] == [0.8, 0.99] and wider_low < low < high < wider_high
+
+
+@pytest.mark.parametrize(("limit", "decision"), [(1.5, "passes"), (0.5, "fails"), (1.01, "undecided")])
+def test_a_limit_of_a_comparison_is_how_much_worse_b_is(limit: float, decision: str, cli: Cli, risky: str) -> None:
+    """Of one ego with itself p_B / p_A is 1; a longer time headway of B makes it less."""
+    words = ("compare", "idm", "idm?time_headway=1.51", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 4000)
+    done = cli(*words, "--max-ratio", limit)
+    assert done.exit_code == GATE_CODES[decision], done.output
+    assert done.stdout.splitlines()[-1].startswith(f"GATE {decision} (exit code {GATE_CODES[decision]}): ")
+
+
+def test_one_file_of_settings_serves_all_three(cli: Cli, risky: str) -> None:
+    """With the settings of each alone: a key that a command does not use is refused by its name."""
+    file = in_file(env="car-following", base=risky, method="mc", max_sim=600, seed=3, horizon=2, chunk=500)
+    one = json.loads(cli("estimate", *file, "--json").stdout)["question"]
+    pair = json.loads(cli("compare", "idm", "idm", *file, "--json").stdout)["question"]
+    names = ("env_id", "base", "method", "max_sim", "seed", "horizon", "chunk")
+    assert (
+        [one[name] for name in names]
+        == [pair[name] for name in names]
+        == [FOLLOWING, risky, "mc", 600, 3, 2.0, 500]
+    )
+    words = in_file(scenario="CutIn", base="i80", method="mc", max_sim=300, seed=3)
+    risk = json.loads(cli("risk", "idm", *words, "--json").stdout)
+    assert list(risk["scenarios"]) == ["cut_in"] and risk["scenarios"]["cut_in"]["base"] == "i80"
+    assert_refused(cli("compare", "idm", "idm", *in_file(env="CutIn", replicates=2)), "does not use", "'replicates'")
+    assert_refused(cli("risk", "idm", *in_file(sead=2)), "unknown key 'sead' (did you mean 'seed'?)")
+
+
+def test_an_estimate_in_highway_env_is_resumed(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = (
+        "estimate",
+        "highway-fast-v0",
+        "--ego",
+        "egos_here:idle",
+        "--method",
+        "ss",
+        "--max-sim",
+        150,
+        *in_file(horizon=1),
+    )
+    whole = json.loads(cli(*words, "--json").stdout)
+    evaluate, made = HighwayEnvProblem.evaluate, [0]
+
+    def stopping(self: HighwayEnvProblem, x: Any) -> Any:
+        made[0] += len(x)
+        if made[0] > 100:
+            raise KeyboardInterrupt
+        return evaluate(self, x)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(HighwayEnvProblem, "evaluate", stopping)
+        assert "go on with: rare-envs resume run\n" in cli(*words, "--out", "run").stderr
+    assert json.loads(cli("resume", "run", "--json").stdout)["p"] == whole["p"]
 
 
 @pytest.fixture(scope="module")
