@@ -499,7 +499,8 @@ def _compare(
                     stack.enter_context(evaluator)
                 asked = question.run_arguments
                 found = samplers.compare(
-                    *evaluators.values(),
+                    evaluators["A"],
+                    evaluators["B"],
                     studies["A"].method,
                     asked.gamma,
                     asked.seed,

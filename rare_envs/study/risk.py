@@ -319,7 +319,12 @@ def risk(
     """
     sites = [sites] if isinstance(sites, str) else [*sites]
     scenarios = [scenarios] if isinstance(scenarios, str) else [*scenarios]
-    whole = {"command": "risk", "ego": ego if isinstance(ego, str) else "", "scenarios": scenarios, "sites": sites}
+    whole: dict[str, Any] = {
+        "command": "risk",
+        "ego": ego if isinstance(ego, str) else "",
+        "scenarios": scenarios,
+        "sites": sites,
+    }
     whole |= {"bases": {name: str(base) for name, base in (bases or {}).items()}, "chunked": executor is not None}
     whole |= {"options": {name: value for name, value in options.items() if name not in CHANGEABLE}}
     return _risk(ego, whole, bases or {}, None if out is None else Path(out), progress, force, executor, options)

@@ -38,7 +38,7 @@ rare-envs risk ppo.zip --out runs/risk
 rare-envs risk ppo.zip --scenario CutIn --max-rate 1 --workers 4
 rare-envs risk idm --sites us101,i80
 rare-envs compare old.zip new.zip CutIn --out runs/compared
-rare-envs compare old.zip new.zip CutIn --max-ratio 1.2
+rare-envs compare old.zip new.zip --max-ratio 1.2
 rare-envs resume runs/cutin
 rare-envs resume runs/risk --workers 4
 rare-envs fit --highd path/to/highD/data --out bases --name cologne

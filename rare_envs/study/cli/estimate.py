@@ -347,16 +347,29 @@ def compare_command(
 def _compare_risks(ego_a: str, ego_b: str, asked: dict[str, Any], out: Path | None, force: bool) -> Answer:
     """Compare two egos in the scenarios of risk."""
     from rare_envs.study.risk import SCENARIO_SET, RiskComparison, compare_risks
+    from rare_envs.study.text import list_gate
+    from samplers.analysis.gate import find_doubt, judge_ends
+    from samplers.comparison import RATIO_COARSE
 
-    if asked["max_ratio"] is not None:
-        raise BadInput("Expected a scenario with --max-ratio: rare-envs compare EGO_A EGO_B CutIn --max-ratio 1.")
+    if asked["assume_traffic"]:
+        raise BadInput("Expected one scenario with --assume-traffic: rare-envs compare EGO_A EGO_B CutIn.")
     executor, base = _make_executor(asked), asked.pop("base")
     options = {name: value for name, value in asked.items() if name not in (*shell.EXECUTOR, "env_id")}
     options |= {"bases": _read_bases([base] if base else [], SCENARIO_SET)}
     options |= {"max_sim": asked["max_sim"] or PAIR_SIMULATIONS, "executor": executor}
 
-    def tell(found: Any, *wrote: str) -> Answer:
-        return Answer(found.to_dict(), "\n".join([str(found), *wrote]), DOUBTFUL if found.warnings else 0)
+    def tell(found: RiskComparison, *wrote: str) -> Answer:
+        verdict, code = None, DOUBTFUL if found.warnings else 0
+        if (limit := asked["max_ratio"]) is not None:
+            ends = (found.interval[1], found.interval[0])
+            low, high = (math.inf if end == 0 else 1.0 / end for end in ends)
+            about: dict[str, Any] = {"quantity": "collisions of B / A", "includes_base": True}
+            confidence = 2.0 * asked["confidence"] - 1.0
+            doubt = find_doubt([each for each in found.warnings if RATIO_COARSE not in each])
+            verdict = judge_ends(limit, (low, high), confidence, doubt, **about)
+            code = GATE_CODES[verdict.decision]
+        data = {**found.to_dict(), "gate": None if verdict is None else verdict.to_dict()}
+        return Answer(data, "\n".join([str(found), *wrote, *list_gate(verdict)]), code)
 
     with as_bad_input(ValueError), shell.telling_unwritten(RiskComparison, tell):
         found = compare_risks(ego_a, ego_b, out=out, progress=True, force=force, **options)

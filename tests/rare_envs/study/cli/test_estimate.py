@@ -209,17 +209,14 @@ def test_a_limit_of_a_comparison_is_how_much_worse_b_is(limit: float, decision: 
     assert done.stdout.splitlines()[-1].startswith(f"GATE {decision} (exit code {GATE_CODES[decision]}): ")
 
 
+@pytest.mark.slow
 def test_one_file_of_settings_serves_all_three(cli: Cli, risky: str) -> None:
     """With the settings of each alone: a key that a command does not use is refused by its name."""
     file = in_file(env="car-following", base=risky, method="mc", max_sim=600, seed=3, horizon=2, chunk=500)
     one = json.loads(cli("estimate", *file, "--json").stdout)["question"]
     pair = json.loads(cli("compare", "idm", "idm", *file, "--json").stdout)["question"]
     names = ("env_id", "base", "method", "max_sim", "seed", "horizon", "chunk")
-    assert (
-        [one[name] for name in names]
-        == [pair[name] for name in names]
-        == [FOLLOWING, risky, "mc", 600, 3, 2.0, 500]
-    )
+    assert [one[name] for name in names] == [pair[name] for name in names] == [FOLLOWING, risky, "mc", 600, 3, 2.0, 500]
     words = in_file(scenario="CutIn", base="i80", method="mc", max_sim=300, seed=3)
     risk = json.loads(cli("risk", "idm", *words, "--json").stdout)
     assert list(risk["scenarios"]) == ["cut_in"] and risk["scenarios"]["cut_in"]["base"] == "i80"
@@ -227,6 +224,7 @@ def test_one_file_of_settings_serves_all_three(cli: Cli, risky: str) -> None:
     assert_refused(cli("risk", "idm", *in_file(sead=2)), "unknown key 'sead' (did you mean 'seed'?)")
 
 
+@pytest.mark.slow
 def test_an_estimate_in_highway_env_is_resumed(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = (
         "estimate",
