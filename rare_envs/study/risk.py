@@ -224,13 +224,11 @@ class Risk:
         total, kinds, counted = self.total, self.kinds, self.people
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
         per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, "", level)
-        beside = "" if counted is None else f"; people in the same events {text.describe_people(counted)}"
-        far = [each for each in self.events if each.uncalibrated]
-        missed = "; ".join(f"{text.name_event(each)} {text.describe_calibration(each)}" for each in far)
+        beside = "" if counted is None else f"; people {text.describe_people(counted)}"
         parts = (f"{text.format_share(r / whole)} {text.describe_kind(kind)}" for kind, r in kinds.items() if whole)
         rows = {
             "Limited by": text.describe_uncertainty(total),
-            "Calibration": missed or text.describe_columns(),
+            "Calibration": text.describe_calibrations(self.events),
             "Crashes": ", ".join(parts),
             "Injuries": "" if self.injuries is None else text.describe_injuries(self.injuries),
         }

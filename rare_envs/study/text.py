@@ -43,7 +43,7 @@ EVENT_NOUNS = {
 """Events, and those of scenarios, in the plural."""
 OTHER_NOUNS = {MODEL: "human driver model", "cc_human": "competent and careful driver", "idm": "IDM"}
 """Drivers that are put in the ego's place."""
-SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulation"}
+SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulations"}
 
 
 def format_rate(value: float) -> str:
@@ -115,6 +115,14 @@ def describe_calibration(each: EventRate) -> str:
     return say("calibrated", model=model, factor=f"{people.CALIBRATED_WITHIN:g}")
 
 
+def describe_calibrations(events: Sequence[EventRate]) -> str:
+    """Return in which events the human driver model comes near people, and why it does not in the others."""
+    near = ", ".join(name_event(each).removesuffix(" of the lead") for each in events if not each.uncalibrated)
+    known = [say("calibrated in", nouns=near, factor=f"{people.CALIBRATED_WITHIN:g}")] if near else []
+    far = (f"{name_event(each)} {describe_calibration(each)}" for each in events if each.uncalibrated)
+    return "; ".join([*known, *far])
+
+
 def describe_parts(shares: Mapping[str, float], unresolved: Mapping[str, float]) -> str:
     """Return the shares of strata in a rate, the largest first, and the upper limits of those with too few failures.
 
@@ -159,30 +167,28 @@ def tabulate_events(events: Sequence[EventRate], total: exposure.TotalRate | Non
 def describe_columns() -> str:
     """Return what the columns of people and of the human driver model are."""
     return (
-        f"{MODEL} and {NO_HEADWAY_RULE} in the same events; within a factor {people.CALIBRATED_WITHIN:g} of people's "
-        "interval a rate is calibrated (people: 100-Car, contacts at any speed)"
+        f"{MODEL} and {NO_HEADWAY_RULE} in the same events; a rate is calibrated within a factor of "
+        f"{people.CALIBRATED_WITHIN:g} of people's interval (people: 100-Car, contacts at any speed)"
     )
 
 
 def describe_uncertainty(total: exposure.TotalRate) -> str:
-    """Return what the uncertainty of a total comes from; empty if it is not known."""
+    """Return what the uncertainty of a total comes from, first what has no lower limit; empty if it is not known."""
     parts = []
-    if total.shares:
-        whole = len(total.determined) == len(total.rates)
-        of_what = "the uncertainty" if whole else "the uncertainty of the others"
-        sources = ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in total.shares)
-        parts.append(f"{of_what} is {sources}")
     for rate in (each for each in total.rates if not each.determined):
+        fact = "no lower limit" if rate.p > 0 else "no failure in a scenario"
         high = format_rate(rate.interval_per_million_km[1])
-        few = say("too few events", what="a lower limit")
-        parts.append(f"{name_scenario(rate.scenario)} has {few} and adds {high} to the upper limit")
+        parts.append(say(fact, name=name_scenario(rate.scenario), high=high))
+    if total.shares:
+        sources = ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in total.shares)
+        parts.append(f"{'the rest: ' if parts else ''}{sources}")
     return "; ".join(parts)
 
 
 def name_source(each: exposure.VarianceShare) -> str:
-    """Return a source of uncertainty in words, such as "the cut-in distribution"."""
+    """Return a source of uncertainty in words, such as "cut-in traffic model"."""
     scenario = name_scenario(each.scenario)
-    nouns = {"base": f"the {scenario} distribution", "site": f"{scenario} at other sites", **SOURCE_NOUNS}
+    nouns = {"base": f"{scenario} {MODEL_NOUN}", "site": f"{scenario} at other sites", **SOURCE_NOUNS}
     return nouns[each.source]
 
 
