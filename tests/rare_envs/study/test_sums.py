@@ -100,7 +100,7 @@ def test_the_page_of_a_sum_names_its_parts_and_its_events(tmp_path: Path, brakin
         assert f'<td class="name">{part["name"]}</td>' in text
         assert f">{100 * part['of_sum']:.0f}\xa0%</td>" in text
     assert "stops of the lead " in text and "slowings of the lead " in text
-    assert "people 4.0 (2.2 to 6.9)" in text
+    assert "people in the same events 4.0 (2.2 to 6.9)" in text
     assert text.count(f"<td>no calibration of {brakings}</td>") == 2
 
 
