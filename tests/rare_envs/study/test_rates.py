@@ -251,7 +251,7 @@ def test_brakings_of_two_kinds_are_two_events(tmp_path: Path, bases: dict[str, s
     assert found.people.count == 13
     assert [each["event"] for each in found.to_dict()["events"]] == ["slowing", "stop"]
     lines = str(found).splitlines()
-    assert "; people in the same events 4.0 (2.2 to 6.9)" in " ".join(lines[:2])
+    assert "; people 4.0 (2.2 to 6.9)" in " ".join(lines[:2])
     (whole,) = (line for line in lines if line.startswith("all "))
     assert whole.endswith(" 4.0 (2.2 to 6.9)") and f" {format_rate(found.total.per_million_km)} (" in whole
 
