@@ -269,9 +269,6 @@ def load_study(folder: str | Path) -> LoadedStudy:
     """
     path = Path(folder)
     if not all((path / name).is_file() for name in (RESULT, FAILURES)):
-        parts = [str(part.parent) for part in sorted(path.glob(f"*/{RESULT}"))]
-        if parts:
-            raise BadInput(f"{str(folder)!r} has several runs, expected one of them: {', '.join(parts[:9])}.")
         raise BadInput(
             f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out "
             f"writes, but {_say_what_is_there(path)}."
@@ -301,7 +298,7 @@ def load_study(folder: str | Path) -> LoadedStudy:
 def _say_what_is_there(path: Path) -> str:
     """Return what is in the place of a run, and which folder to give if there is one near."""
     if not path.is_dir():
-        return f"{'it is a file' if path.exists() else 'there is no such folder'}"
+        return "it is a file" if path.exists() else "there is no such folder"
     runs = [str(each.parent) for each in sorted(path.glob(f"*/{RESULT}"))]
     if (path.parent / RESULT).is_file():
         runs.append(str(path.parent))
@@ -310,9 +307,8 @@ def _say_what_is_there(path: Path) -> str:
     if next(path.glob(f"*/{JOURNAL}"), None):
         return "the command that writes into it was stopped: give the same command again"
     names = sorted(each.name for each in path.iterdir())
-    return (
-        f"it has {', '.join(names[:MOST_NAMED])}{' and more' * (len(names) > MOST_NAMED)}" if names else "it is empty"
-    )
+    more = " and more" if len(names) > MOST_NAMED else ""
+    return f"it has {', '.join(names[:MOST_NAMED])}{more}" if names else "it is empty"
 
 
 def _read_object(path: Path) -> dict[str, Any]:

@@ -34,6 +34,7 @@ from rare_envs.traffic.crash import injury_risk
 from samplers.analysis import NO_OUTCOME_LABEL
 from samplers.problem import FloatArray
 from tests.rare_envs.study.fitted_files import write_fitted
+from tests.rare_envs.study.refusals import in_file
 
 FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
 
@@ -163,7 +164,7 @@ def test_an_attentive_driver_does_again_what_it_did_and_avoids_what_a_coasting_e
 ) -> None:
     def fails(ego: str, *more: str) -> dict[str, dict[str, float]]:
         out = tmp_path / ego
-        asked = ("--method", "mc", "--max-sim", 200, "--horizon", 3, "--seed", 0)
+        asked = ("--method", "mc", "--max-sim", 200, "--seed", 0, *in_file(horizon=3))
         done = cli("estimate", FOLLOWING, "--ego", ego, "--base", risky, "--out", out, *asked, *more)
         assert done.exit_code == 0, done.stderr
         result, listed = json.loads((out / "result.json").read_text()), read_failures(out)
