@@ -252,7 +252,7 @@ def find_policies(drivers: Any, scenario: Scenario) -> tuple[TrafficPolicy, ...]
             continuous actions.
     """
     _, *names = scenario.vehicle_names
-    given = drivers
+    given: Any = drivers
     if isinstance(drivers, str | Path):
         parts = [str(each).partition("=") for each in str(drivers).split(",")]
         named = all(mark and name.isidentifier() for name, mark, _ in parts)

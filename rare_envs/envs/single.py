@@ -143,9 +143,10 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
         watched = self.world.clock.stride > 1 and (self._recorder or self._renderer.is_window)
         watch = self._watch if watched else None
         with torch.inference_mode():
-            how = {"watch": watch, "reward": self._reward}
             given = np.asarray(action)[None]
-            episode, terms, features = take_step(self.world, self._compiled, self._episode, given, **how)
+            episode, terms, features = take_step(
+                self.world, self._compiled, self._episode, given, watch=watch, reward=self._reward
+            )
             if features is not None and self.world.sensing.observation == "features":
                 observation: SingleObservation = features[0]
             else:

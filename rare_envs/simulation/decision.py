@@ -180,7 +180,7 @@ def find_reward(reward: Any) -> EgoReward:
     return of_function
 
 
-def _weigh(given: Mapping[str, float]) -> EgoReward:
+def _weigh(given: Mapping[str, Any]) -> EgoReward:
     """Return the reward with these weights of `TERMS`, their names with HighwayEnv's ending or without."""
     weights = {str(name).removesuffix("_reward"): weight for name, weight in given.items()}
     for name, weight in weights.items():

@@ -53,7 +53,8 @@ class TrafficPolicy(NamedTuple):
     """A policy in the place of a vehicle around the ego, without a memory of its own."""
 
     vehicle: int
-    driver: Driver
+    driver: Any
+    """A `PolicyDriver`."""
     name: str
     """Its file, or its class."""
 
