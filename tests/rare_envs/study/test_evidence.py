@@ -103,6 +103,7 @@ def test_the_page_says_what_it_is_not(run: Path) -> None:
     assert "no conformity assessment" in page and "<svg" in page and "us101" in page
 
 
+@pytest.mark.slow
 def test_a_report_files_the_evidence_of_each_run_of_a_risk(tmp_path: Path, cli: Callable[..., Result]) -> None:
     folder = tmp_path / "risk"
     cli("risk", "idm", "--max-sim", 500, "--out", folder)
