@@ -511,9 +511,10 @@ def describe_odds(p: float, noun: str = "") -> str:
 def _describe_limit(estimate: Estimate, model: str) -> str:
     """Return whether the events behind the base distribution or the simulations make the interval as wide as it is."""
     base, n, vague = estimate.base_uncertainty, f"{estimate.n_sim:,}", [p for p in estimate.parts if not p.resolved]
-    ends = sorted(((part.share * part.interval[1], part.name) for part in vague), reverse=True)
-    few = "".join(say("too few failures", name=part, high=format_alike(high)[0]) for high, part in ends[:NAMED_STRATA])
-    few += f"; {len(ends) - NAMED_STRATA} more strata" if len(ends) > NAMED_STRATA else ""
+    highest = sorted(((part.share * part.interval[1], part.name) for part in vague), reverse=True)
+    named = highest[:NAMED_STRATA]
+    few = "".join(say("too few failures", name=part, high=format_alike(high)[0]) for high, part in named)
+    few += f"; {len(highest) - NAMED_STRATA} more strata" if len(highest) > NAMED_STRATA else ""
     own, ends = estimate.sequence or estimate.interval, find_ends(estimate, base)
     return describe_limit(estimate.p, own, ends, n, model, base, few)
 

@@ -64,7 +64,7 @@ def env_id_of(name: str) -> str:
     module = name.rpartition(":")[0] if isinstance(name, str) else ""
     if module:
         import_module(module, f"the environment {name!r}")
-    env_id = complete_id(name)
+    env_id: str = complete_id(name)
     own = str(env_id).rpartition(":")[2]
     if own in SCENARIOS or own in map(kinematics_id, SCENARIOS):
         return env_id
@@ -95,7 +95,7 @@ def is_highway_env_id(env_id: object) -> bool:
     return re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(env_id)) is not None
 
 
-def complete_id(name: str) -> str:
+def complete_id(name: Any) -> Any:
     """Return the registered id that a name means; else what is given, without "rare_envs:".
 
     Namespace and version may be left out, and words be joined in any way: "cut_in", "CutIn" and "cut-in-v1" are

@@ -226,8 +226,8 @@ def summarise_refits(
             bound = high
     with np.errstate(over="ignore"):
         values = np.exp(log_values)
-    few = count_uncovered(ess)
-    about = f"{few} of {len(ess)} refits rest on fewer than 10 effective failing points"
+    uncovered = count_uncovered(ess)
+    about = f"{uncovered} of {len(ess)} refits rest on fewer than 10 effective failing points"
     coarse = [f"{about}: their interval is imprecise; more simulations (max_sim) help."]
     return BaseUncertainty(
         value=value,
@@ -243,7 +243,7 @@ def summarise_refits(
         fitted_to=fitted.fitted_to,
         family=fitted.family,
         n_sim=n_sim,
-        warnings=(*(coarse if few else ()), *doubts),
+        warnings=(*(coarse if uncovered else ()), *doubts),
     )
 
 
