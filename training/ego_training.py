@@ -191,7 +191,7 @@ def train_ego(
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
         raise ValueError(f"Expected a seed from 0 to 2^32 - 1, got {seed}.")
-    from rare_envs.scenarios.registry import env_id_of
+    from rare_envs.scenarios.registry import env_id_of, split_layout
 
     ids = tuple(map(env_id_of, (env_id,) if isinstance(env_id, str) else env_id))
     if not ids or len(set(ids)) < len(ids) or (retraining is not None and len(ids) > 1):
@@ -216,7 +216,9 @@ def train_ego(
     from training.vec_env import sb3_vec_env
 
     hyperparameters = HYPERPARAMETERS[algo]
-    env = sb3_vec_env(ids, num_envs, discrete=hyperparameters.discrete, even_strata=even_strata, **make_kwargs)
+    kind = {**split_layout(ids[0])[1], **make_kwargs}.get("action", "continuous")
+    make_kwargs |= {"action": "discrete"} if hyperparameters.discrete and kind == "continuous" else {}
+    env = sb3_vec_env(ids, num_envs, even_strata=even_strata, **make_kwargs)
     told = "Stopped at once: of the last steps nothing is kept."
     try:
         with use_one_thread(), _progress_bar(progress) as bar, defer_signals() as received:

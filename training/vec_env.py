@@ -24,7 +24,6 @@ def sb3_vec_env(
     id: str | Sequence[str],
     num_envs: int,
     seed: int | None = None,
-    discrete: bool = False,
     even_strata: bool = False,
     **make_kwargs: Any,
 ) -> VecMonitor:
@@ -34,11 +33,9 @@ def sb3_vec_env(
         id: Environment id, such as "rare_envs/CutIn-v0", or several whose observations have one space.
         num_envs: Number of episodes that run side by side; several ids share them evenly.
         seed: Seed of the first reset; an algorithm's own seed replaces it.
-        discrete: Offer the rows of `rare_envs.control.actions.DISCRETE_ACTIONS` as a `Discrete` action
-            space, for algorithms such as DQN; an environment with `action="meta"` has one already.
         even_strata: Draw the strata of a traffic model equally often, regardless of their shares, so that a policy
             meets the rare ones: of the cutters of CutIn-v1 one in 6,000 does not look.
-        **make_kwargs: Keyword arguments of `gym.make` for these environments.
+        **make_kwargs: Keyword arguments of `gym.make` for these environments, such as `action="discrete"` for DQN.
 
     Returns:
         A `VecEnv` that also records returns and lengths of episodes.
@@ -58,7 +55,6 @@ def sb3_vec_env(
         [False, False, False, False]
     """
     import rare_envs
-    from rare_envs.control.actions import DISCRETE_ACTIONS
 
     ids = (id,) if isinstance(id, str) else tuple(id)
     if not ids or num_envs < len(ids):
@@ -68,8 +64,7 @@ def sb3_vec_env(
     for batch in batches if even_strata else ():
         own: Any = batch.unwrapped
         own.space = _even_out(own.space)
-    continuous = isinstance(batches[0].single_action_space, gym.spaces.Box)
-    env = BatchedVecEnv(*batches, discrete_actions=np.asarray(DISCRETE_ACTIONS) if discrete and continuous else None)
+    env = BatchedVecEnv(*batches)
     if seed is not None:
         env.seed(seed)
     return VecMonitor(env)
@@ -140,8 +135,8 @@ class BatchedVecEnv(VecEnv):
     of a batch live in one simulation, so attributes and methods are those of the batch.
     """
 
-    def __init__(self, *batches: VectorEnv[Any, Any, Any], discrete_actions: NDArray[Any] | None = None) -> None:
-        """Wrap batches with equal spaces; continuous actions (K, 2) may be chosen from by index."""
+    def __init__(self, *batches: VectorEnv[Any, Any, Any]) -> None:
+        """Wrap batches with equal spaces."""
         first = batches[0]
         for batch in batches:
             mode = batch.metadata.get("autoreset_mode")
@@ -154,12 +149,8 @@ class BatchedVecEnv(VecEnv):
         self.batches = batches
         ends = np.cumsum([batch.num_envs for batch in batches]).tolist()
         self._rows = [slice(end - batch.num_envs, end) for batch, end in zip(batches, ends, strict=True)]
-        self._table = discrete_actions
         self._actions: NDArray[Any] | None = None
-        action_space = first.single_action_space
-        if discrete_actions is not None:
-            action_space = gym.spaces.Discrete(len(discrete_actions))
-        super().__init__(ends[-1], first.single_observation_space, action_space)
+        super().__init__(ends[-1], first.single_observation_space, first.single_action_space)
 
     def reset(self) -> Any:
         """Start new episodes everywhere, with the seed and options set before, if any."""
@@ -176,7 +167,7 @@ class BatchedVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for `step_wait`, shape (B, 2), or (B,) for discrete ones."""
-        self._actions = actions if self._table is None else self._table[actions]
+        self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
         """Advance the batches by one step; ended episodes are followed by new ones at once."""

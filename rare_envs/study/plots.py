@@ -49,8 +49,6 @@ MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
 VIEW_BEHIND, VIEW_FAR_BEHIND, VIEW_AHEAD = 12.0, 45.0, 48.0
 """Extent of a bird's-eye view of the road around the ego [m]; further behind if there is traffic."""
-NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
-"""Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper limits of the curves' axes over their largest values: room for the legend."""
 LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = rendering.ROLE_COLOURS["ego"], "#c0392b", "#b8b8b8"
@@ -195,57 +193,6 @@ def draw_answer(axes: Axes, report: Report) -> None:
         said += f"no failure counts in {estimate.n_sim:,} simulations"
     axes.set_title(said, fontweight="bold")
     axes.figure.legend(loc="outside lower center", ncols=2, frameon=False)
-
-
-def draw_convergence(axes: Axes, result: Mapping[str, Any]) -> None:
-    """Draw the estimate against the simulations spent, level by level, and its interval; of a sum the parts."""
-    trace, gamma, p = result.get("trace") or [], float(result["gamma"]), float(result["p"])
-    low, high = (float(end) for end in result["interval"])
-    shares = {part["name"]: part["share"] for part in result.get("parts") or []}
-    runs = sorted({(level["run"], level.get("stratum") or "") for level in trace})
-    by_levels = any(level["gamma"] != gamma for level in trace)
-    seen: list[float] = []
-    for run in runs:
-        levels = [level for level in trace if (level["run"], level.get("stratum") or "") == run]
-        spent = np.cumsum([level["n_sim"] for level in levels])
-        values = shares.get(run[1], 1.0) * np.array([level["estimate"] or np.nan for level in levels])
-        seen += [value for value in values if value > 0]
-        (line,) = axes.plot(spent, values, "o-", color=LINE_COLOUR, alpha=max(0.25, 1 / len(runs)), markersize=4)
-        if run[1]:
-            line.set(color=f"C{list(shares).index(run[1]) + 1}", label=run[1], alpha=0.8)
-        gammas, cov = (np.array([level[name] for level in levels], dtype=float) for name in ("gamma", "cov"))
-        if len(runs) == 1 and by_levels:  # each threshold that differs from the one before
-            for i in np.flatnonzero(np.isfinite(values) & (np.diff(gammas, prepend=np.nan) != 0)):
-                place: Any = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 8}
-                axes.annotate(f"f ≤ {gammas[i]:.3g}", (spent[i], values[i]), **place)
-        elif len(runs) == 1:
-            cov = np.nan_to_num(cov, nan=np.inf)
-            spread = np.exp(NORMAL_QUANTILE * np.minimum(cov, WIDEST_COV))
-            axes.fill_between(spent, values / spread, values * spread, color=LINE_COLOUR, alpha=0.15, linewidth=0)
-    axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.12, linewidth=0)
-    if p == 0 and not result.get("n_failures"):
-        n_sim = int(result["n_sim"])
-        spent = np.geomspace(1.0, max(n_sim, 2), 100)
-        bound = np.minimum(high * n_sim / spent, 1.0)
-        axes.plot(spent, bound, color=HIT_COLOUR, linewidth=1, label="upper limit without a failure, ~ 1 / simulations")
-    if p > 0:
-        axes.axhline(p, color=HIT_COLOUR, linewidth=1, label="result")
-    label = f"{100 * float(result['confidence']):g} % interval"
-    axes.plot([], [], color=HIT_COLOUR, alpha=0.25, linewidth=8, label=label)
-    axes.set_yscale("log")
-    if by_levels or not seen:
-        smallest = min([v for v in (low, p, high / 30) if v > 0], default=1e-9)
-        axes.set_ylim(smallest / 3, 1.5)
-    else:  # nothing but P[f <= gamma] is estimated on the way
-        least, most = min(*seen, max(low, high / 30)), max(*seen, high)
-        axes.set_ylim(least / 1.5, min(most * 1.5, 1.5))
-    axes.set_xlim(left=0)
-    each = "stratum" if shares else f"of {len(runs)} runs"
-    axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each {each}")
-    axes.set_ylabel("P[f ≤ threshold of the level]" if by_levels else f"P[f ≤ {gamma:g}]")
-    way = "From ordinary traffic to the failures, level by level" if by_levels else "The estimate, batch by batch"
-    axes.set_title(way, fontsize=10)
-    axes.legend(loc="upper right", frameon=False)
 
 
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:

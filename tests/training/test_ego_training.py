@@ -56,7 +56,7 @@ def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> N
     ego = load_ego(path)
     assert isinstance(ego, SavedEgo)
     assert ego.algorithm == algo
-    env = sb3_vec_env(ENV, 4, seed=0, discrete=algo == "dqn")
+    env = sb3_vec_env(ENV, 4, seed=0, action="discrete" if algo == "dqn" else "continuous")
     assert ego.observation_space == env.observation_space
     expected = spaces.Discrete(len(DISCRETE_ACTIONS)) if algo == "dqn" else env.action_space
     assert ego.action_space == expected

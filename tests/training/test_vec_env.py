@@ -101,15 +101,6 @@ def test_it_agrees_with_the_vec_env_of_stable_baselines(batches: tuple[tuple[int
     np.testing.assert_array_equal(ours.reset(), again)
 
 
-def test_discrete_actions_are_looked_up() -> None:
-    table = np.array([[-1.0, 0.0], [0.25, 0.5]], np.float32)
-    env = BatchedVecEnv(batch(9, 9), discrete_actions=table)
-    assert env.action_space == spaces.Discrete(2)
-    env.reset()
-    observation = env.step(np.array([1, 0]))[0]
-    np.testing.assert_array_equal(observation[:, 2], [0.75, -1.0])
-
-
 def test_attributes_and_methods_are_those_of_the_batch() -> None:
     env = BatchedVecEnv(batch(9, 9, 9))
     env.reset()

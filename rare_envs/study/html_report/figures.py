@@ -7,6 +7,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from rare_envs.study.plots import (
     LINE_COLOUR,
     ORDINARY_COLOUR,
     SEVERE,
-    draw_convergence,
     drawing,
     show_literally,
 )
@@ -27,8 +27,6 @@ from rare_envs.study.text import Result
 from samplers.analysis.curve import WIDEST_BAND
 from samplers.problem import FloatArray
 
-WIDE_ON_PHONES = 420
-"""Width on a narrow screen of a wide figure that has no form of its own for it [pixels]."""
 FORMATS = ("svg", "pdf", "png")
 """Of figures as files."""
 Draw = Callable[[Figure], object]
@@ -40,20 +38,11 @@ Size = tuple[float, float]
 class FigureOfPage:
     """A figure of the page, drawn once for each format that is asked for."""
 
-    def __init__(
-        self, name: str, caption: str, draw: Draw, size: Size, narrow: tuple[Draw, Size] | None = None
-    ) -> None:
+    def __init__(self, name: str, caption: str, draw: Draw, size: Size) -> None:
         self.name, self.caption, self._draw, self._size = name, caption, draw, size
-        self._narrow = None if narrow is None else FigureOfPage(f"{name}-narrow", caption, *narrow)
 
     def to_svg(self) -> str:
         """Return it as an element of a page: it has the width of its place, and its text is text."""
-        if self._narrow is None:
-            return self._make_svg()
-        wide, narrow = self._make_svg(), self._narrow.to_svg()
-        return wide.replace("<svg", '<svg class="wide"', 1) + narrow.replace("<svg", '<svg class="narrow"', 1)
-
-    def _make_svg(self) -> str:
         buffer = io.StringIO()
         with drawing(**{"svg.fonttype": "none", "svg.hashsalt": self.name}):
             self._make().savefig(buffer, format="svg", metadata={"Date": None})
@@ -64,8 +53,7 @@ class FigureOfPage:
         # ids of matplotlib, such as figure_1, are the same in every figure
         text = re.sub(r'\bid="([^"]+)"', rf'id="{self.name}-\1"', text)
         text = re.sub(r'(xlink:href="#|href="#|url\(#)(?=[^)"])', rf"\g<1>{self.name}-", text)
-        # no larger than with type of normal size; a phone shows wide ones as large as can be read, and moves them
-        size = f"max-width:{110 * self._size[0]:.0f}px;min-width:{WIDE_ON_PHONES if self._size[0] > 7 else 0}px"
+        size = f"max-width:{110 * self._size[0]:.0f}px"  # no larger than with type of normal size
         label = html.escape(self.caption)
         return text.replace("<svg", f'<svg role="img" aria-label="{label}" style="{size}"', 1).strip()
 
@@ -85,8 +73,8 @@ class FigureOfPage:
 
 PANEL_SIZE = (4.4, 3.0)
 """Size of a figure of one panel [inch]."""
-MAX_HISTOGRAMS = 12
-"""Parameters that are shown, those that failures shift most."""
+MAX_HISTOGRAMS, PANELS = 12, 2
+"""Parameters that are shown, those that failures shift most, and how many of them side by side."""
 
 
 def draw_band(
@@ -109,11 +97,11 @@ def draw_band(
 
 
 def draw_parameters(
-    figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str], columns: int = 3
+    figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str]
 ) -> None:
     """Draw each of k parameters in ordinary traffic (n, k) and among failures (m, k) with weights (m,)."""
-    rows = math.ceil(len(labels) / columns)
-    panels = np.atleast_1d(figure.subplots(rows, min(columns, len(labels)), squeeze=False)).ravel()
+    rows = math.ceil(len(labels) / PANELS)
+    panels = np.atleast_1d(figure.subplots(rows, min(PANELS, len(labels)), squeeze=False)).ravel()
     for j, axes in enumerate(panels):
         if j >= len(labels):
             axes.set_axis_off()
@@ -134,12 +122,7 @@ def draw_parameters(
 def figures_of_result(result: Result, measure: str, prefix: str = "") -> dict[str, FigureOfPage]:
     """Return the figures that the numbers of a run allow, by name; `prefix` stands before it in files and ids."""
     curve, severity = result.get("curve"), result.get("severity")
-    drawn: dict[str, tuple[str, Draw]] = {
-        "convergence": (
-            "The estimate on the way, and the result",
-            lambda figure: draw_convergence(figure.subplots(), result),
-        )
-    }
+    drawn = dict[str, tuple[str, Draw]]()
     if isinstance(curve, dict):
         gamma = float(result["gamma"])
         words = (f"threshold of f{f', {measure}' if measure else ''}", "P[f ≤ threshold]")
@@ -154,11 +137,8 @@ def figures_of_result(result: Result, measure: str, prefix: str = "") -> dict[st
 def figure_of_parameters(
     ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str], prefix: str = ""
 ) -> FigureOfPage:
-    """Return the figure of `draw_parameters`: three panels side by side, two on a narrow screen."""
-
-    def make(columns: int, width: float) -> tuple[Draw, Size]:
-        height = 0.4 + 1.9 * math.ceil(len(labels) / columns)
-        return lambda f: draw_parameters(f, ordinary, failing, weights, labels, columns), (width, height)
-
+    """Return the figure of `draw_parameters`."""
+    size = (4.4, 0.4 + 1.9 * math.ceil(len(labels) / PANELS))
     caption = "Parameters in ordinary traffic and among failures, the most shifted first"
-    return FigureOfPage(f"{prefix}parameters", caption, *make(3, 8.0), make(2, 4.4))
+    draw = partial(draw_parameters, ordinary=ordinary, failing=failing, weights=weights, labels=labels)
+    return FigureOfPage(f"{prefix}parameters", caption, draw, size)
