@@ -25,7 +25,7 @@ SHOWN = {
     "samplers_without_cars": ("P[f <= 0] ", "two-stage  p =", "importance of the parameters"),
     "train_and_estimate": ("P[f <= 0] ", "collide: p in"),
     "your_own_data": ("40 cut-ins", "collisions per million km", "40 + 40 events"),
-    "your_own_ego": ("P[f <= 0] ", "p_A", " 0.1 ", " 1e-06 "),
+    "your_own_ego": ("P[f <= 0] ", "Ratio        A fails ", " 0.1 ", " 1e-06 "),
 }
 """Some of what they print."""
 
