@@ -7,6 +7,8 @@ ordinary regression on them. b is looked for from 0.1 to 20 m/s^2, where A is no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ from rare_envs.distributions.coordinates import Coordinates, Difference
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
+from training.fit.filters import check_spread
 from training.fit.mixture import COVARIANCE_FLOOR
 
 LEAST_LIMIT, MOST_LIMIT = 0.1, 20.0
@@ -143,6 +146,13 @@ def profile_limit(closing: FloatArray, gap: FloatArray, ends: tuple[float, float
     return {f"{b:g}": round(pair.climb(b).log_likelihood - without, 2) for b in PROFILE}
 
 
+def check_starts_vary(joint: FloatArray, apart: FloatArray, parameters: Sequence[Parameter]) -> None:
+    """Raise a `NoSpread` if a parameter of starts, or the closing speed, is nearly constant; as `fit_accepted`."""
+    closing = replace(parameters[0], name="ego_speed - cut_in_speed")
+    check_spread(np.column_stack([joint, joint[:, 0] - joint[:, 1]]), (*parameters[:5], closing))
+    check_spread(apart, parameters[5:])
+
+
 def fit_accepted(joint: FloatArray, apart: FloatArray, parameters: tuple[Parameter, ...]) -> AcceptedGaps:
     """Return accepted gaps fitted to starts.
 
@@ -150,8 +160,12 @@ def fit_accepted(joint: FloatArray, apart: FloatArray, parameters: tuple[Paramet
         joint: ego_speed, cut_in_speed, lead_speed, cut_in_gap and lead_gap of starts, (n, 5).
         apart: lateral_offset and duration of lane changes, which are independent of the others, (m, 2).
         parameters: Of these seven.
+
+    Raises:
+        NoSpread: A parameter or the closing speed is nearly constant.
     """
     names = tuple(p.name for p in parameters)
+    check_starts_vary(joint, apart, parameters)
     ego, cutter, lead, gap, lead_gap = joint.T
     ends = {p.name: (p.low, p.high) for p in parameters}
     pair = fit_pair(ego - cutter, gap, ends["cut_in_gap"])

@@ -34,7 +34,7 @@ from training.fit.mixture import (
     SMALLEST_COMPONENT,
 )
 from training.fit.refits import FOLD_STARTS, Asked, Fit
-from training.fit.strata import Neighbours, fit_cut_in, fit_hard_brake, keep_strata
+from training.fit.strata import Neighbours, fit_cut_in, fit_hard_brake, keep_accepted, keep_strata
 
 SETTINGS = {
     "covariance_floor": COVARIANCE_FLOOR,
@@ -93,6 +93,7 @@ def fit_base(
         events = keep_strata(events)
         fit = fit_hard_brake(scenario, events, asked)
     elif neighbours is not None:
+        events = keep_accepted(events)
         fit = fit_cut_in(scenario, events, neighbours, frequency, asked)
     else:
         fit = _fit_in_best_system(scenario, events, system, asked)

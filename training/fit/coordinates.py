@@ -19,7 +19,7 @@ from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Co
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
-from training.fit.filters import EventSet
+from training.fit.filters import EventSet, check_spread
 from training.fit.mixture import MAX_COMPONENTS, Candidate, Components, append_independent, select_mixture
 from training.fit.refits import FOLD_STARTS, Asked
 
@@ -125,8 +125,10 @@ def fit_system(
     seed: int = 0,
     starts: int | None = None,
 ) -> SystemFit:
-    """Return a mixture in one system; columns apart get one component of their own."""
+    """Return a mixture in one system; columns apart get one component of their own. `NoSpread` if one is constant."""
     n = events.joint.shape[1]
+    check_spread(events.joint, parameters)
+    check_spread(events.apart, parameters[n:])
     components, candidates = _fit_in(system.coordinates(parameters[:n]), events.joint, seed, MAX_COMPONENTS, starts)
     if events.apart.shape[1]:
         apart, _ = _fit_in(system.coordinates(parameters[n:]), events.apart, seed, 1, None)

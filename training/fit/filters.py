@@ -113,6 +113,9 @@ FILTER_REASONS = {
 """Reasons of filters, by kind of filter, unit of the parameter, or its name."""
 
 
+LEAST_SPREAD, FEW_EVENTS = 1e-3, 3
+"""Share of a parameter's range that the standard deviation of its events reaches if the parameter varies, and number of
+events below which it is not looked at: these are too few for any fit."""
 LEAST_ACCEPTED_GAP = 1.0
 """Least gap behind of a cutter who looked [m]: as that of `CutIn-v0`."""
 
@@ -191,6 +194,30 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
         log += drop_events(keep, rules, recipe.apart)
     word = "scene" if recipe.cluster == ("scene",) else "half-minute"
     return EventSet(points, clusters, _table_of(events, recipe.apart, keep), word, tuple(log), answers)
+
+
+class NoSpread(ValueError):
+    """A parameter has nearly one value in all events, so that no density can be fitted."""
+
+
+def find_constant(x: FloatArray, box: Sequence[Parameter]) -> int | None:
+    """Return the first column of events (n, d) that varies by less than `LEAST_SPREAD`; None if there is none."""
+    size = np.array([p.high - p.low for p in box[: x.shape[1]]])
+    flat = np.flatnonzero(x.std(axis=0) < LEAST_SPREAD * size) if len(x) >= FEW_EVENTS else []
+    return int(flat[0]) if len(flat) else None
+
+
+def check_spread(x: FloatArray, box: Sequence[Parameter]) -> None:
+    """Raise a `NoSpread` that names a parameter with nearly one value in all events (n, d)."""
+    which = find_constant(x, box)
+    if which is not None:
+        p, value = box[which], x[:, which].mean()
+        raise NoSpread(
+            f"{p.name} is {value:.4g} {p.unit} in nearly all of {len(x):,} events (standard deviation "
+            f"{x[:, which].std():.1g}), expected one of {LEAST_SPREAD * (p.high - p.low):.1g} or more: check this "
+            "column and its unit in the recordings, add recordings in which it varies, or choose scenarios by "
+            "--scenario."
+        )
 
 
 def _table_of(events: Mapping[str, NDArray[Any]], columns: Sequence[str], keep: NDArray[np.bool_]) -> FloatArray:

@@ -49,18 +49,18 @@ from training.fit.filters import (
     CLUSTER_FRAMES,
     EVENT_DEFINITIONS,
     EVENT_RECIPES,
+    EventSet,
+    NoSpread,
     filter_events,
-    read_events,
     recorded_parameters,
 )
 from training.fit.refits import MIN_CLUSTERS
 from training.fit.strata import (
     NEAR_IF_UNSEEN,
     Neighbours,
-    check_starts,
+    check_events,
     find_neighbours,
     keep_neighbours,
-    keep_strata,
 )
 
 COMMAND = "rare-envs fit, with --highd or another option of recordings"
@@ -70,7 +70,7 @@ EXTRACTORS = {
     "hard_brake": hard_brake_events,
 }
 """Functions that extract the events of a scenario."""
-CUT_IN, HARD_BRAKE = "cut_in", "hard_brake"
+CUT_IN = "cut_in"
 LEAST_NEIGHBOURS = 500
 """Neighbours at random times that a recording of whole traffic has in its first minute."""
 TICKS_PER_SECOND = 10
@@ -156,10 +156,10 @@ def fit_own_bases(
     """Extract the events of recordings, and fit scenarios to them; None for all that have enough events.
 
     Writes `<scenario>_events.csv` and `<scenario>_<name>.json` into a folder and returns the latter; a ValueError if a
-    recording is broken, or the events of all scenarios are too few (then the files of events are written).
+    recording is broken, the events of all scenarios are too few (then the files of events are written), or too few or
+    too alike in all (then nothing is written).
     """
     chosen, tell = tuple(scenarios or EVENT_RECIPES), _make_teller(progress)
-    out.mkdir(parents=True, exist_ok=True)
     names, traffic, parts = set[str](), np.zeros(4), list[dict[str, Events]]()
     beside = list[tuple[FloatArray, NDArray[Any]]]()
     for table in tables:
@@ -179,22 +179,33 @@ def fit_own_bases(
     for scenario in chosen:
         own = [part[scenario] for part in parts]
         pooled[scenario] = {column: np.concatenate([events[column] for events in own]) for column in own[0]}
+    usable, faults = dict[str, EventSet](), dict[str, ValueError]()
+    for scenario in chosen:
+        found = filter_events(pooled[scenario], EVENT_RECIPES[scenario], recorded_parameters(scenario))
+        tell(scenario, f"{len(found.joint):,} events")
+        try:
+            usable[scenario] = check_events(scenario, found)
+            if left_out := len(found.joint) - len(usable[scenario].joint):
+                typer.echo(f"{scenario}: {left_out} left out: {usable[scenario].log[-2]['reason']}", err=True)
+        except ValueError as error:
+            faults[scenario] = error
+    alike = {name: error for name, error in faults.items() if isinstance(error, NoSpread)}
+    if alike and not usable:
+        raise ValueError(" ".join(f"{name}: {error}" for name, error in alike.items()) + " Nothing is written.")
+    out.mkdir(parents=True, exist_ok=True)
+    for scenario in chosen:
         write_events(pooled[scenario], out / f"{scenario}_events.csv")
         typer.echo(out / f"{scenario}_events.csv")
     too_few, written = 0, list[Path]()
     for scenario in chosen:
-        path, recipe = out / f"{scenario}_events.csv", EVENT_RECIPES[scenario]
-        events = filter_events(read_events(path, recipe), recipe, recorded_parameters(scenario))
+        path = out / f"{scenario}_events.csv"
         asked: dict[str, Any] = {"n_refits": n_refits, "seed": seed, "report": partial(tell, scenario)}
-        tell(scenario, f"{len(events.joint):,} events; fitting")
         try:
+            if scenario in faults:
+                raise faults[scenario]
+            events = usable[scenario]
             if scenario == CUT_IN:
-                check_starts(events)
                 asked["neighbours"] = _choose_neighbours(beside)
-            elif scenario == HARD_BRAKE:
-                found, events = len(events.joint), keep_strata(events)
-                if len(events.joint) < found:
-                    typer.echo(f"{scenario}: {found - len(events.joint)} left out: {events.log[-2]['rule']}", err=True)
             frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
             base = fit_base(scenario, events, source, COMMAND, frequency=frequency, **asked)
         except KeyboardInterrupt:

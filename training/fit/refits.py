@@ -9,6 +9,7 @@ events, refits that choose 96 and 98 % of 135 and 134 (`benchmarks/uncertainty/r
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
@@ -17,7 +18,7 @@ import numpy as np
 
 from rare_envs.distributions.events import PredictiveCheck
 from rare_envs.distributions.space import Distribution
-from training.fit.filters import EventSet
+from training.fit.filters import EventSet, NoSpread
 
 T = TypeVar("T")
 N_REFITS = 30
@@ -67,14 +68,18 @@ class Asked:
         fit: Callable[[EventSet, np.random.Generator], T],
         family: Callable[[T], object] = type,
     ) -> list[T]:
-        """Return refits to events drawn anew, none if they are of under `MIN_CLUSTERS`."""
+        """Return refits to events drawn anew, none if they are of under `MIN_CLUSTERS`.
+
+        Events that are drawn such that a parameter has one value are drawn again.
+        """
         if len(np.unique(events.clusters)) < MIN_CLUSTERS:
             return []
         rng, refits = np.random.default_rng(self.seed), list[T]()
         wanted = N_REFITS if self.n_refits is None else self.n_refits
         while len(refits) < wanted:
             self.report(f"refit {len(refits) + 1} of {wanted}")
-            refits.append(fit(draw_events(events, rng), rng))
+            with contextlib.suppress(NoSpread):
+                refits.append(fit(draw_events(events, rng), rng))
             if self.n_refits is None and len(refits) == N_REFITS and len({family(each) for each in refits}) > 1:
                 wanted = MORE_REFITS
         return refits

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.acceptance import AcceptedGaps
+from rare_envs.distributions.acceptance import AcceptedGaps, needed_after
 from rare_envs.distributions.coordinates import Coordinates, Difference
 from rare_envs.distributions.events import EventFrequency, PredictiveCheck
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
@@ -36,7 +36,7 @@ from rare_envs.distributions.stratified import CutNormals, StratifiedDistributio
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT
 from rare_envs.scenarios.registry import find_scenario
 from samplers.problem import FloatArray
-from training.fit.acceptance import LEAST_LIMIT, MOST_LIMIT, fit_accepted, profile_limit
+from training.fit.acceptance import LEAST_LIMIT, MOST_LIMIT, check_starts_vary, fit_accepted, profile_limit
 from training.fit.checks import (
     BRAKING_STATES,
     CHECK_DRAWS,
@@ -46,7 +46,7 @@ from training.fit.checks import (
     check_states,
 )
 from training.fit.coordinates import COORDINATE_SYSTEMS, CoordinateSystem, SystemFit, fit_system
-from training.fit.filters import EventSet, drop_events, recorded_parameters
+from training.fit.filters import EventSet, check_spread, drop_events, recorded_parameters
 from training.fit.mixture import COVARIANCE_FLOOR, append_independent, select_mixture
 from training.fit.refits import FOLD_STARTS, Asked, Fit, draw_events
 
@@ -169,6 +169,18 @@ def _join_drivers(accepted: Distribution, unseen: Distribution, share: float) ->
         Stratum("looked", 1.0 - float(f"{share:.4g}"), ProductDistribution((accepted, CutNormals(ends, free)))),
     )
     return StratifiedDistribution(strata, np.array([ATTENTION_LIMIT]), column=7)
+
+
+def keep_accepted(events: EventSet) -> EventSet:
+    """Return starts of cut-ins without those after which no braking avoids a contact: nobody who looks accepts them."""
+    ego, cutter, _, gap, _ = events.joint.T
+    keep = np.isfinite(needed_after(gap, ego - cutter))
+    if keep.all():
+        return events
+    reason = "the gap is closed before the vehicle behind answers: not looked, or an error of the recording"
+    log = drop_events(np.full(len(keep), True), [("braking of the vehicle behind avoids a contact", reason, keep)])
+    own = {name: getattr(events, name)[keep] for name in ("joint", "clusters", "answers") if getattr(events, name).size}
+    return replace(events, log=(*events.log, *log), **own)
 
 
 def check_starts(events: EventSet) -> None:
@@ -340,6 +352,22 @@ def keep_strata(events: EventSet) -> EventSet:
     rule = f"brakings {'to a standstill' if enough[1] else 'that leave some speed'} alone"
     log = drop_events(np.full(len(keep), True), [(rule, f"fewer than {LEAST_BRAKINGS} are no stratum", keep)])
     return replace(events, joint=events.joint[keep], clusters=events.clusters[keep], log=(*events.log, *log))
+
+
+def check_events(scenario: str, events: EventSet) -> EventSet:
+    """Return the events that a scenario of recordings is fitted to; a ValueError if they are too few or too alike."""
+    box = recorded_parameters(scenario)
+    if scenario == "cut_in":
+        events = keep_accepted(events)
+        check_starts(events)
+        check_starts_vary(events.joint, events.apart, box)
+    elif scenario == "hard_brake":
+        events = keep_strata(events)
+        for part in _split_brakings(events, box):
+            check_spread(part.events.joint, part.box)
+    else:
+        check_spread(events.joint, box)
+    return events
 
 
 def _share_of_last(parts: Sequence[_Brakings]) -> float:

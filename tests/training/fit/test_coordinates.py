@@ -147,7 +147,7 @@ def test_a_parameter_that_does_not_vary_is_named():
     events = closing_events(40)
     joint = events.joint.copy()
     joint[:, 0] = 20.0
-    with pytest.raises(ValueError, match="Expected ego_speed to vary, got 20 in all 40 events"):
+    with pytest.raises(ValueError, match="ego_speed is 20 m/s in nearly all of 40 events"):
         fit_system(EventSet(joint, events.clusters), LOG_GAP, FOLLOWING)
 
 

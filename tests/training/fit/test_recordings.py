@@ -25,8 +25,10 @@ from tests.training.data.recordings import (
 from training.command_line import EventOptions
 from training.data.events import braking_exposure, car_following_events, cut_in_events
 from training.data.table import synthetic_traffic
-from training.fit.filters import EVENT_RECIPES, filter_events, read_events, recorded_parameters
+from training.fit import recordings
+from training.fit.filters import EVENT_RECIPES, EventSet, filter_events, read_events, recorded_parameters
 from training.fit.recordings import count_events, fit_bases, fit_own_bases, observe_traffic
+from training.fit.strata import check_events
 
 GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
 
@@ -148,7 +150,7 @@ def test_too_few_events_are_an_error_that_names_all_scenarios(simulated, quick, 
     with pytest.raises(ValueError, match="too few"):  # there is no lateral offset
         fit(tmp_path, scenarios=["cut_in"], coifman=path, force=True)
     read, events = capsys.readouterr().err.splitlines()
-    assert "rows read" in read and events.startswith("cut_in: ") and events.endswith(" events; fitting")
+    assert "rows read" in read and events.startswith("cut_in: ") and events.endswith(" events")
 
 
 def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path):
@@ -189,3 +191,34 @@ def test_bad_arguments_are_refused(tmp_path):
         recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})
         with pytest.raises(ValueError, match=message):
             fit_bases(recordings, tmp_path / "out", **options)
+
+
+@pytest.mark.parametrize("parameter", ["lateral_offset", "duration", "ego_speed", "cut_in_gap"])
+@pytest.mark.parametrize("spread", [0.0, 2e-4])
+def test_events_that_hardly_vary_are_refused_before_anything_is_written(parameter, spread, tmp_path, monkeypatch):
+    number = [p.name for p in recorded_parameters("cut_in")].index(parameter)
+
+    def starts(_):
+        rng = np.random.default_rng(0)
+        x = np.array(GOOD) * np.exp(0.1 * rng.standard_normal((30, 7)))
+        x[:, number] = GOOD[number] + spread * rng.standard_normal(30)
+        recipe = EVENT_RECIPES["cut_in"]
+        events = dict(zip(recipe.columns, x.T, strict=True)) | dict.fromkeys(recipe.answers, np.full(30, np.nan))
+        flags = {"start_seen": np.full(30, True), "phase": np.full(30, "start"), "ego": np.arange(30)}
+        return events | flags | {"recording": np.full(30, "a"), "frame": 300 * np.arange(30)}
+
+    monkeypatch.setitem(recordings.EXTRACTORS, "cut_in", starts)
+    table = synthetic_traffic(seconds=4.0, per_lane=2)
+    out = tmp_path / "bases"
+    message = rf"cut_in: {parameter} is [\d.]+ \S+ in nearly all of 30 events .* Nothing is written"
+    with pytest.raises(ValueError, match=message) as refused:
+        fit_own_bases([table], ["cut_in"], out, "own", n_refits=2)
+    assert "\n" not in str(refused.value) and not out.exists()
+
+
+def test_a_start_that_no_braking_saves_is_of_nobody_who_looked():
+    rng = np.random.default_rng(0)
+    x = np.array(GOOD) * np.exp(0.1 * rng.standard_normal((30, 7)))
+    x[0, [0, 1, 3]] = 20.0, 12.0, 4.0  # 8 m/s faster, 4 m behind
+    kept = check_events("cut_in", EventSet(x[:, :5], np.arange(30), x[:, 5:]))
+    assert len(kept.joint) == 29 and kept.log[-2]["dropped"] == 1
