@@ -145,10 +145,10 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
 
     @property
     def state_space(self) -> "spaces.Box[np.float32]":
-        """Space of `state`: any numbers, shape (N, 4), speeds not negative."""
-        low = np.full((self.world.scenario.vehicles, 4), -np.inf, dtype=np.float32)
-        low[:, 3] = 0.0
-        return spaces.Box(low, np.inf, dtype=np.float32)
+        """Space of `state`, shape (N, 4): within 1,000 km, 1,000 rad and 1,000 m/s, speeds not negative."""
+        high = np.tile(np.float32([1e6, 1e6, 1e3, 1e3]), (self.world.scenario.vehicles, 1))
+        low = np.where([False, False, False, True], np.float32(0.0), -high)
+        return spaces.Box(low, high, dtype=np.float32)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -93,7 +93,7 @@ def test_what_is_masked_or_missing_is_no_outcome(form):
 
 def test_a_p_above_a_half_comes_with_the_direction():
     wrong_way = samplers.FunctionProblem(lambda x: (x[:, 0] > 2.0).astype(int), 2)
-    assert "where large f is, give -f" in samplers.estimate(wrong_way, "mc", seed=0, max_sim=500).remarks[0]
+    assert "If large f is dangerous, return -f" in samplers.estimate(wrong_way, "mc", seed=0, max_sim=500).remarks[0]
 
 
 def test_a_series_system_is_given_by_its_terms_alone():

@@ -68,7 +68,8 @@ def test_the_answer_is_short_unless_details_are_asked_for(cli: Cli, risky: str, 
 
 
 def test_what_is_unusual_in_the_most_likely_failure_is_named(cli: Cli, risky: str, tmp_path: Path) -> None:
-    shown = " ".join(cli(*SMALL, "--base", risky, "--out", tmp_path).stdout.split())
+    cli(*SMALL, "--base", risky, "--out", tmp_path)
+    shown = " ".join(" ".join(json.loads((tmp_path / "result.json").read_text())["text"]).split())
     named = re.findall(r"(ego at|lead at|gap) (-?[\d.]+) (?:m|m/s) \(usually (-?[\d.]+) to (-?[\d.]+)\)", shown)
     failure = json.loads((tmp_path / "result.json").read_text())["failures"][0]["parameters"]
     for words, value, low, high in named:
