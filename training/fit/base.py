@@ -13,6 +13,7 @@ from rare_envs.distributions.events import EventFrequency
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.scenarios.registry import find_scenario
+from samplers.bases import find_base_fault
 from samplers.problem import FloatArray
 from training.fit.checks import check_predictions
 from training.fit.coordinates import (
@@ -26,7 +27,7 @@ from training.fit.coordinates import (
     held_out_log_prob,
     refit,
 )
-from training.fit.filters import EventSet, recorded_parameters
+from training.fit.filters import EventSet, NoSpread, recorded_parameters
 from training.fit.mixture import (
     COVARIANCE_FLOOR,
     EM_STARTS,
@@ -78,7 +79,7 @@ def fit_base(
         report: Told of each fit and refit.
 
     Raises:
-        ValueError: The events are too few, or there is no such coordinate system.
+        ValueError: The events are too few or too alike, or there is no such coordinate system.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -97,6 +98,7 @@ def fit_base(
         fit = fit_cut_in(scenario, events, neighbours, frequency, asked)
     else:
         fit = _fit_in_best_system(scenario, events, system, asked)
+    _check_numbers(scenario, events, fit.distribution)
     record = {
         "kind": "fitted to recorded events",
         **fit.criteria,
@@ -116,6 +118,20 @@ def fit_base(
         checks=fit.checks,
         record=record,
     )
+
+
+def _check_numbers(scenario: str, events: EventSet, fitted: Distribution) -> None:
+    """Raise a `NoSpread` that names the narrowest parameter if the numbers of a fit are too inexact for estimates."""
+    box, fault = recorded_parameters(scenario), find_base_fault(fitted, len(find_scenario(scenario).parameters))
+    if fault is not None:
+        spreads = [*events.joint.std(axis=0), *events.apart.std(axis=0)]
+        pairs = list(zip(spreads, box, strict=False))
+        spread, least = min(pairs, key=lambda pair: pair[0] / (pair[1].high - pair[1].low))
+        raise NoSpread(
+            f"{least.name} varies too little (standard deviation {spread:.2g} {least.unit}, in a range of "
+            f"{least.low:g} to {least.high:g}): the numbers of the fitted model are too inexact ({fault}). "
+            "Add recordings in which it varies."
+        )
 
 
 def _fit_in_best_system(scenario: str, events: EventSet, system: str | None, asked: Asked) -> Fit:

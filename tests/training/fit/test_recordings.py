@@ -26,6 +26,7 @@ from training.command_line import EventOptions
 from training.data.events import braking_exposure, car_following_events, cut_in_events
 from training.data.table import synthetic_traffic
 from training.fit import recordings
+from training.fit.base import fit_base
 from training.fit.filters import EVENT_RECIPES, EventSet, filter_events, read_events, recorded_parameters
 from training.fit.recordings import count_events, fit_bases, fit_own_bases, observe_traffic
 from training.fit.strata import check_events
@@ -222,3 +223,12 @@ def test_a_start_that_no_braking_saves_is_of_nobody_who_looked():
     x[0, [0, 1, 3]] = 20.0, 12.0, 4.0  # 8 m/s faster, 4 m behind
     kept = check_events("cut_in", EventSet(x[:, :5], np.arange(30), x[:, 5:]))
     assert len(kept.joint) == 29 and kept.log[-2]["dropped"] == 1
+
+
+def test_a_model_too_narrow_for_estimates_is_refused():
+    rng = np.random.default_rng(0)
+    x = np.array(GOOD) * np.exp(0.1 * rng.standard_normal((60, 7)))
+    x[:, 3] = 15.0 + 0.3 * rng.standard_normal(60)
+    us101 = load_base(find_scenario("cut_in"), "us101")
+    with pytest.raises(ValueError, match=r"cut_in_gap varies too little \(standard deviation 0\.3"):
+        fit_base("cut_in", EventSet(x[:, :5], np.arange(60), x[:, 5:]), {}, "", neighbours=us101, n_refits=2)
