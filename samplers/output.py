@@ -243,6 +243,11 @@ FACTS: Mapping[str, str] = MappingProxyType(
         "p without limits": "{p}{odds}; no lower or upper limit ({sure})",
         "nothing failed": "none in {n} simulations; below {high} ({sure})",
         "failures of the search alone": "none counts in p, {found} found in the search; below {high} ({sure})",
+        "status converged": "converged",
+        "status no_hits": "no failure found",
+        "status budget": "not converged, more simulations (max_sim) are needed",
+        "status stopped": "stopped early",
+        "status stalled": "the search came no closer to failures",
         "limited by simulations": "{n} simulations; more of them (max_sim) help{few}",
         "limited by events": "{events}; more recordings help, more simulations do not{exact}",
         "limited by both": "{events} ({share}) and {n} simulations ({rest}); more of both help{few}{exact}",
@@ -306,23 +311,39 @@ def say(fact: str, **values: object) -> str:
 
 
 def fold_rows(rows: Sequence[Row], most: int = MOST_LINES) -> list[str]:
-    """Return facts as lines, at most so many: the longest texts are cut, and end with "...".
+    """Return facts as lines, at most so many: the longest texts are cut behind a clause, and end with "...".
 
     A word that is longer than a line is not broken, nor a command whose spaces are no-break ones, for pasting.
     """
     label = max([LABEL, *(len(name) + 2 for name, _ in rows)])
     width = WIDTH - label
-    texts = (re.sub("[ \n]+", " ", text) for _, text in rows)
-    folded = [textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) for text in texts]
+    texts = [re.sub("[ \n]+", " ", text) for _, text in rows]
+    folded = [_wrap(text, width) for text in texts]
     while sum(map(len, folded)) > most and max(map(len, folded)) > 1:
-        longest = max(reversed(folded), key=len)
-        longest.pop()
-        longest[-1] = f"{textwrap.shorten(longest[-1].removesuffix(' ...'), width - 4, placeholder='')} ..."
+        number = max(reversed(range(len(rows))), key=lambda each: len(folded[each]))
+        folded[number] = _wrap(_cut(texts[number], " ".join(folded[number][:-1])), width)
     return [
         f"{'' if number else name:<{label}}{line}".replace("\xa0", " ")
         for (name, _), lines in zip(rows, folded, strict=True)
         for number, line in enumerate(lines)
     ]
+
+
+def _wrap(text: str, width: int) -> list[str]:
+    """Return a text as lines; words are not broken."""
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+
+
+def _cut(text: str, start: str) -> str:
+    """Return a text up to the end of a clause in the second half of its start, or else of a word, outside brackets."""
+    ends = [
+        found.start()
+        for found in re.finditer(" ", text[: len(start) - 3])
+        if text.count("(", 0, found.start()) == text.count(")", 0, found.start())
+    ]
+    clauses = [end for end in ends if text[end - 1] in ";,." and 2 * end > len(start)]
+    words = [end for end in ends if not text[end - 1].isdigit()]
+    return f"{text[: max(clauses or words or ends or [0])].rstrip(';,.')} ..."
 
 
 def unfold_rows(lines: Sequence[str]) -> list[Row]:

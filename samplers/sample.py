@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import betaincinv, logsumexp, ndtr, ndtri, stdtrit
 
+from samplers.output import FACTS
 from samplers.problem import FloatArray
 
 __all__ = [
@@ -74,7 +75,7 @@ COARSE = "the estimate is imprecise"
 def describe_outcome(status: Status | str, warnings: Sequence[str]) -> str:
     """Return how a run ended, in words: "converged" stands alone only if there is no warning."""
     if status != Status.CONVERGED or not warnings:
-        return str(status)
+        return FACTS.get(f"status {status}", str(status))
     return f"finished with {len(warnings)} warning{'s' * (len(warnings) != 1)}"
 
 

@@ -17,7 +17,16 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.output import StoredMethod, format_alike, read_object, register_stored, unfold_rows, write_object
+from samplers.output import (
+    LABEL,
+    StoredMethod,
+    fold_rows,
+    format_alike,
+    read_object,
+    register_stored,
+    unfold_rows,
+    write_object,
+)
 from tests.samplers.fitted_bases import fitted, resampled, run
 
 
@@ -91,6 +100,14 @@ def test_an_answer_is_at_most_twelve_lines_of_under_a_hundred_columns(gamma):
         assert len(lines) <= 12 and max(map(len, lines)) < 100 and lines == each.to_dict()["text"].splitlines()
         assert unfold_rows(lines)[0][0] == f"P[f <= {gamma:g}]"
     assert "it may be wrong, " in str(told) and "..." in str(told)
+
+
+def test_details_say_in_words_how_a_run_ended():
+    problem = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=1)
+    for status in samplers.methods.Status:
+        estimate = replace(samplers.estimate(problem, "mc", seed=0, max_sim=100), status=status, warnings=())
+        assert "_" not in estimate.details() and "budget" not in estimate.details()
+        assert estimate.to_dict()["status"] == status
 
 
 def test_says_what_the_problem_holds_fixed():
@@ -278,3 +295,24 @@ def test_a_method_of_another_package_keeps_its_name(tmp_path):
     assert str(found) == str(result)
     with pytest.raises(ValueError, match="cannot run"):
         samplers.estimate(problem, found.method)
+
+
+@pytest.mark.parametrize("most", [1, 2, 3])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "cut-in: no lower limit, adds up to 4,500 (more simulations or recordings help); the rest: 62 % cut-in base "
+        "distribution, 21 % hard brake base distribution (38 + 265 events of 17 scenes, 30 refits), 17 % simulations, "
+        "and something else that is long enough for a third line of this text",
+        "one clause without an end that goes on and on for more than two lines of an answer, as (the longest ones, in "
+        "brackets do; they have 1,000 words), 12,000 m and more behind it, and an end",
+    ],
+)
+def test_a_long_fact_is_cut_behind_a_clause(text: str, most: int) -> None:
+    lines = fold_rows([("Limited by", text)], most)
+    assert len(lines) <= most and max(map(len, lines)) < 100
+    shown = " ".join(line[LABEL:] for line in lines)
+    if shown != text:
+        kept = shown.removesuffix(" ...")
+        assert shown.endswith(" ...") and text.startswith(kept) and kept.count("(") == kept.count(")")
+        assert text[len(kept)] in ";," or (text[len(kept)] == " " and not kept[-1].isdigit())
