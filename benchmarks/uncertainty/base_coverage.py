@@ -25,8 +25,8 @@ from benchmarks import RESULTS
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from samplers.problem import FloatArray
+from training.fit.coordinates import draw_events
 from training.fit.filters import EventSet
-from training.fit.refits import draw_events
 
 COVERAGE_RESULT = RESULTS / "base_coverage.json"
 DIM = 3

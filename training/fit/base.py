@@ -18,8 +18,11 @@ from samplers.problem import FloatArray
 from training.fit.checks import check_predictions
 from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
+    FOLD_STARTS,
     N_FOLDS,
+    Asked,
     CoordinateSystem,
+    Fit,
     SystemFit,
     choose_system,
     describe_family,
@@ -34,7 +37,6 @@ from training.fit.mixture import (
     EVENTS_PER_COMPONENT,
     SMALLEST_COMPONENT,
 )
-from training.fit.refits import FOLD_STARTS, Asked, Fit
 from training.fit.strata import Neighbours, fit_cut_in, fit_hard_brake, keep_accepted, keep_strata
 
 SETTINGS = {

@@ -45,6 +45,7 @@ from training.data.events import (
 from training.data.formats import load_recordings
 from training.data.table import DT, Trajectories
 from training.fit.base import fit_base, format_base
+from training.fit.coordinates import MIN_CLUSTERS
 from training.fit.filters import (
     CLUSTER_FRAMES,
     EVENT_DEFINITIONS,
@@ -54,7 +55,6 @@ from training.fit.filters import (
     filter_events,
     recorded_parameters,
 )
-from training.fit.refits import MIN_CLUSTERS
 from training.fit.strata import (
     NEAR_IF_UNSEEN,
     Neighbours,

@@ -45,10 +45,18 @@ from training.fit.checks import (
     check_answers,
     check_states,
 )
-from training.fit.coordinates import COORDINATE_SYSTEMS, CoordinateSystem, SystemFit, fit_system
+from training.fit.coordinates import (
+    COORDINATE_SYSTEMS,
+    FOLD_STARTS,
+    Asked,
+    CoordinateSystem,
+    Fit,
+    SystemFit,
+    draw_events,
+    fit_system,
+)
 from training.fit.filters import EventSet, check_spread, drop_events, recorded_parameters
 from training.fit.mixture import COVARIANCE_FLOOR, append_independent, select_mixture
-from training.fit.refits import FOLD_STARTS, Asked, Fit, draw_events
 
 PAIR = [0, 1, 3]
 """Columns of a start with the speeds behind and ahead and the gap between."""

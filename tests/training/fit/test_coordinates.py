@@ -10,17 +10,18 @@ from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import find_scenario
 from training.fit import coordinates as module
 from training.fit import mixture as mixture_fit
-from training.fit import refits
 from training.fit.coordinates import (
     COORDINATE_SYSTEMS,
+    FOLD_STARTS,
+    Asked,
     choose_system,
+    draw_events,
     fit_system,
     held_out_log_prob,
     refit,
 )
 from training.fit.filters import EventSet, recorded_parameters
 from training.fit.mixture import EM_ITERATIONS, SMALLEST_COMPONENT, TOLERANCE, fit_mixture, select_mixture
-from training.fit.refits import FOLD_STARTS, Asked, draw_events
 
 
 def test_a_component_on_a_handful_of_events_is_rejected(quick):
@@ -158,8 +159,8 @@ def events(n, seed=0, per_cluster=1):
 
 
 def test_more_refits_where_the_number_of_components_differs(monkeypatch):
-    monkeypatch.setattr(refits, "N_REFITS", 4)
-    monkeypatch.setattr(refits, "MORE_REFITS", 7)
+    monkeypatch.setattr(module, "N_REFITS", 4)
+    monkeypatch.setattr(module, "MORE_REFITS", 7)
     for numbers, wanted in (([1, 1, 1, 1], 4), ([1, 2, 1, 1, 1, 1, 1], 7)):
         made = iter(numbers)
 
