@@ -327,3 +327,5 @@ def test_in_a_folder_such_as_tmp_the_owner_counts(own: Path, monkeypatch: pytest
     load_ego(own)
     os.chown(own, 12345, -1) if os.getuid() == 0 else monkeypatch.setattr("os.getuid", lambda: own.stat().st_uid + 1)
     refuse(own, "belongs to another user, in a folder to which everybody may add")
+    own.parent.chmod(0o755)  # a colleague's: nobody else can have put it there
+    load_ego(own)
