@@ -44,20 +44,19 @@ MAX_U = 38.0
 """Beyond this on the quantile scale there is no number."""
 
 
-def needed_after(gap: Any, closing: Any, wait: float = ANSWER_TIME) -> Any:
-    """Return the deceleration that the vehicle behind needs after some time, inf where it is too late [m/s^2].
+def needed_after(gap: Any, closing: Any) -> Any:
+    """Return the deceleration that the vehicle behind needs after `ANSWER_TIME`, inf where it is too late [m/s^2].
 
     Args:
         gap: Bumper to bumper [m].
         closing: Speed behind less speed ahead [m/s].
-        wait: Time until it brakes [s].
 
     Example:
         >>> needed_after(np.array([10.0, 10.0, 3.0]), np.array([4.0, -1.0, 4.0])).round(3).tolist()
         [1.333, 0.0, inf]
     """
     closing = np.maximum(closing, 0.0)
-    left = gap - wait * closing
+    left = gap - ANSWER_TIME * closing
     late = (left <= 0.0) & (closing > 0.0)
     return np.where(late, np.inf, closing * closing / (2.0 * np.where(left > 0.0, left, 1.0)))
 

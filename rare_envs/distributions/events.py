@@ -30,11 +30,11 @@ def require_count(what: str, value: object, least: int = 1) -> None:
         raise ValueError(f"Expected {what} as a whole number, {least} or more, got {value!r}.")
 
 
-def require_number(what: str, value: object, low: float = 0.0, high: float = math.inf) -> None:
-    """Raise a ValueError unless a value is a finite number above `low` and at most `high`."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value <= high or math.isinf(value):
-        above = f"above {low:g}" if math.isinf(high) else f"above {low:g}, at most {high:g}"
-        raise ValueError(f"Expected {what} as a number {above}, got {value!r}.")
+def require_number(what: str, value: object, high: float = math.inf) -> None:
+    """Raise a ValueError unless a value is a finite number above 0 and at most `high`."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= high or math.isinf(value):
+        most = "" if math.isinf(high) else f", at most {high:g}"
+        raise ValueError(f"Expected {what} as a number above 0{most}, got {value!r}.")
 
 
 def require_text(what: str, value: object) -> None:

@@ -370,11 +370,10 @@ def resume(
     on_error: str | None = None,
     trust: bool = False,
     progress: bool = False,
-    mend: bool = False,
     executor: Executor | None = None,
 ) -> Report:
     """Continue an interrupted run; the answer is that of an undisturbed one."""
-    journal, question = writing.continue_journal(folder, mend)
+    journal, question = writing.continue_journal(folder)
     with contextlib.closing(journal), output_folder(folder, *RESULT_FILES):
         part_of = (journal.head.get("whole") or {}).get("command", "")
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:

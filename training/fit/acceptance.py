@@ -117,14 +117,13 @@ class _Pair:
         return PairFit(np.array([mean, intercept + slope * mean]), covariance, b, -float(found.fun))
 
 
-def fit_pair(closing: FloatArray, gap: FloatArray, ends: tuple[float, float], limit: float | None = None) -> PairFit:
+def fit_pair(closing: FloatArray, gap: FloatArray, ends: tuple[float, float]) -> PairFit:
     """Return the likeliest distribution of closing speeds [m/s] and gaps [m], (n,) each, with gaps between two ends.
 
     Args:
         closing: Speed behind less speed of the cutter.
         gap: Bumper to bumper, within the ends.
         ends: Of the scenario's range.
-        limit: b, None for the likeliest, inf for no factor.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -134,8 +133,6 @@ def fit_pair(closing: FloatArray, gap: FloatArray, ends: tuple[float, float], li
         True
     """
     pair = _Pair(closing, gap, ends)
-    if limit is not None:
-        return pair.climb(limit)
     return max((pair.climb(None, start) for start in STARTS), key=lambda fit: fit.log_likelihood)
 
 
