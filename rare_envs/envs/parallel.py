@@ -146,7 +146,7 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
     @property
     def state_space(self) -> "spaces.Box[np.float32]":
         """Space of `state`, shape (N, 4): within 1,000 km, 1,000 rad and 1,000 m/s, speeds not negative."""
-        high = np.tile(np.float32([1e6, 1e6, 1e3, 1e3]), (self.world.scenario.vehicles, 1))
+        high = np.tile(np.array([1e6, 1e6, 1e3, 1e3], np.float32), (self.world.scenario.vehicles, 1))
         low = np.where([False, False, False, True], np.float32(0.0), -high)
         return spaces.Box(low, high, dtype=np.float32)
 

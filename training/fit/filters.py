@@ -203,7 +203,9 @@ class NoSpread(ValueError):
 def find_constant(x: FloatArray, box: Sequence[Parameter]) -> int | None:
     """Return the first column of events (n, d) that varies by less than `LEAST_SPREAD`; None if there is none."""
     size = np.array([p.high - p.low for p in box[: x.shape[1]]])
-    flat = np.flatnonzero(x.std(axis=0) < LEAST_SPREAD * size) if len(x) >= FEW_EVENTS else []
+    if len(x) < FEW_EVENTS:
+        return None
+    flat = np.flatnonzero(x.std(axis=0) < LEAST_SPREAD * size)
     return int(flat[0]) if len(flat) else None
 
 
