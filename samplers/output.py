@@ -279,6 +279,8 @@ FACTS: Mapping[str, str] = MappingProxyType(
         "unusual": "{name} {value} {unit} (usually {low} to {high})",
         "ratio": "{a} {fails} {ratio} times as often as {b}; {sure} interval {low} to {high}",
         "ratio without limits": "{a} {fails} {ratio} times as often as {b}; no lower or upper limit ({sure})",
+        "ratio above": "{a} {fails} more than {low} times as often as {b} ({sure}); no upper limit",
+        "ratio below": "{a} {fails} {ratio} times as often as {b}; below {high} ({sure}), no lower limit",
         "ratio of a safe one": "{a} {fails} less than {high} times as often as {b} ({sure}); no failure of {a} found",
         "ratio to a safe one": "{a} {fails} more than {low} times as often as {b} ({sure}); no failure of {b} found",
         "ratio not known": "not known: no failure of {a} or {b} found",

@@ -450,12 +450,17 @@ def compare_egos(
     algo_b: str | None = None,
     stats_b: str | None = None,
     executor: Executor | None = None,
+    whole: Mapping[str, Any] | None = None,
 ) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
-    """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end."""
-    if out is not None and not force:
+    """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end.
+
+    A part of a sum, whose name and arguments are `whole`, is continued, and keeps its journals.
+    """
+    if out is not None and not force and whole is None:
         writing.check_no_results(out, COMPARISON)
     questions = {"A": question, "B": replace(question, ego=ego_b, algo=algo_b, stats=stats_b)}
-    return _compare({name: prepare(each) for name, each in questions.items()}, progress, out, force, executor)
+    studies = {name: prepare(each) for name, each in questions.items()}
+    return _compare(studies, progress, out, force, executor, whole)
 
 
 def resume_comparison(
@@ -470,7 +475,12 @@ def resume_comparison(
 
 
 def _compare(
-    studies: dict[str, Study], progress: bool, out: Path | None, force: bool, executor: Executor | None
+    studies: dict[str, Study],
+    progress: bool,
+    out: Path | None,
+    force: bool,
+    executor: Executor | None,
+    whole: Mapping[str, Any] | None = None,
 ) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
     """Compare the egos A and B of two studies of the same scenarios."""
     studies = {name: settle_chunk(study, executor is not None) for name, study in studies.items()}
@@ -483,7 +493,9 @@ def _compare(
     question = studies["A"].question
     questions = {name: study.question for name, study in studies.items()}
     with (
-        writing.journals_of({"command": "compare"}, out, questions, force, COMPARISON, FAILURES, BLOCKS) as journals,
+        writing.journals_of(
+            whole or {"command": "compare"}, out, questions, force, COMPARISON, FAILURES, BLOCKS
+        ) as journals,
         contextlib.ExitStack() as stack,
     ):
         kept, evaluators = dict[str, RowKeeper](), dict[str, Evaluator]()

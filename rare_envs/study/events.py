@@ -55,7 +55,7 @@ class EventRate:
     @property
     def people(self) -> HumanBenchmark | None:
         """Contacts of people in the same event; None if nobody has counted them."""
-        return people_in(self.event).contacts if self.event in COUNTED else None  # type: ignore[arg-type]
+        return count_people(self.event)
 
     @property
     def uncalibrated(self) -> str:
@@ -78,9 +78,18 @@ class EventRate:
         }
 
 
+def count_people(event: str) -> HumanBenchmark | None:
+    """Return people's contacts in a kind of event; None if nobody has counted them."""
+    return people_in(event).contacts if event in COUNTED else None  # type: ignore[arg-type]
+
+
 def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
     """Return people's contacts in several kinds of event together; None if one of them was not counted."""
-    counted = [each.people for each in events]
+    return add_people([each.people for each in events])
+
+
+def add_people(counted: Sequence[HumanBenchmark | None]) -> HumanBenchmark | None:
+    """Return contacts of several kinds of event together; None if one of them was not counted."""
     known = [each for each in counted if each is not None]
     if not known or len(known) < len(counted):
         return None

@@ -28,15 +28,18 @@ from rare_envs.startup import __version__
 from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
 from rare_envs.study.evaluate import compare_egos, run, run_into
-from rare_envs.study.events import EventRate, sum_people
+from rare_envs.study.events import COUNTED, EventRate, add_people, count_people, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
-from rare_envs.study.report import Report, find_frequency, judge_rate
-from rare_envs.study.run_folder import COMPARISON, JOURNAL, RISK
-from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
+from rare_envs.study.report import MODEL_NOUN, Report, find_frequency, judge_rate
+from rare_envs.study.run_folder import COMPARISON, FAILURES, JOURNAL, RISK
+from rare_envs.study.writing import SUM, check_no_results, clear_runs, unwritten_results
+from samplers.analysis.gate import find_doubt, judge_ends
+from samplers.comparison import RATIO_COARSE, Side
 from samplers.evaluate import Executor
-from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
-from samplers.result import list_warnings
+from samplers.output import LABEL, MOST_LINES, WIDTH, Row, fold_rows, format_alike, say
+from samplers.problem import FloatArray
+from samplers.result import describe_limit, list_warnings
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
@@ -474,6 +477,10 @@ def _evaluate(
     return ScenarioRisk(report=report, rate=rate, site_factors=factors)
 
 
+SIDES = ("A", "B")
+"""Folders of the journals of both egos."""
+UNLIMITED = 1e6
+"""Upper over lower limit of a ratio from which on it is said to have none."""
 LEAST = 1e-300
 """Floor of a ratio whose logarithm is taken."""
 
@@ -490,6 +497,10 @@ class RiskComparison:
     """The comparison in each scenario, by name."""
     frequencies: Mapping[str, EventFrequency]
     """How often the events of each scenario happen."""
+    max_ratio: float | None = None
+    """Limit of the collisions of B over those of A."""
+    assume_traffic: bool = False
+    """Whether the verdict takes the traffic models as exact."""
 
     @cached_property
     def per_million_km(self) -> dict[str, float]:
@@ -507,20 +518,35 @@ class RiskComparison:
         a, b = self.per_million_km["a"], self.per_million_km["b"]
         return a / b if b > 0 else math.inf if a > 0 else math.nan
 
+    @property
+    def confidence(self) -> float:
+        """Nominal coverage of the intervals."""
+        return next(iter(self.scenarios.values())).confidence
+
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """Interval of the ratio, of the confidence of the comparisons.
+        """Interval of the ratio with the errors of the traffic models."""
+        return self._find_interval(exact=False)
+
+    @cached_property
+    def interval_if_exact(self) -> tuple[float, float]:
+        """Interval of the ratio if the traffic models are exact."""
+        return self._find_interval(exact=True)
+
+    def _draw(self, exact: bool) -> FloatArray:
+        """Return draws of the sums of A and of B per km, the least and the most of each, (2, 2, n).
 
         From draws of B's rate in each scenario, by simulations, counts and refits, and of the ratio there, by its
-        interval with the traffic model. An ego without a failure in a scenario has 0 there for one limit of the ratio,
-        and its upper limit for the other.
+        interval, with the traffic model or if that is `exact`. An ego without a failure in a scenario has 0 there for
+        one limit of the ratio, and its upper limit for the other.
         """
         rng, n = np.random.default_rng(0), exposure.RATE_DRAWS
-        ends = np.zeros((2, 2, n))  # of A and of B, the least and the most of each draw
+        ends = np.zeros((2, 2, n))
         for name, pair in self.scenarios.items():
             z, per_km = exposure.normal_quantile(pair.confidence), self.frequencies[name].per_km
-            known = pair.base_uncertainty
-            spread = 0.0 if known is None or not math.isfinite(known.spread) else known.spread
+            known = None if exact else pair.base_uncertainty
+            either = None if exact else pair.either.base_uncertainty
+            spread = 0.0 if either is None or not math.isfinite(either.spread) else either.spread
             common = per_km * np.exp(math.hypot(self.frequencies[name].log_sd, spread) * rng.standard_normal(n))
             a, b = (
                 common * side.p * np.exp((side.cov if side.p > 0 else 0.0) * rng.standard_normal(n))
@@ -535,12 +561,72 @@ class RiskComparison:
             most_b = common * pair.b.interval[1] if pair.a.p == 0 else a / max(low, LEAST)
             ends[0] += np.stack((a, a if pair.a.p > 0 else most_a))
             ends[1] += np.stack((b, b if pair.b.p > 0 else most_b))
+        return ends
+
+    def _find_interval(self, exact: bool) -> tuple[float, float]:
+        """Return the interval of the ratio."""
+        ends, tails = self._draw(exact), exposure.tail_levels(self.confidence)
         if not ends[:, 1].any():
             return 0.0, math.inf
-        tails = exposure.tail_levels(next(iter(self.scenarios.values())).confidence)
         with np.errstate(divide="ignore", invalid="ignore"):
             least, most = ends[0, 0] / ends[1, 1], np.where(ends[1, 0] > 0, ends[0, 1] / ends[1, 0], math.inf)
         return float(np.quantile(least, tails[0])), float(np.quantile(most, tails[1], method="inverted_cdf"))
+
+    def _find_rate_interval(self, sides: Sequence[Side]) -> exposure.RateInterval:
+        """Return the interval of the rate of one ego per million km, of its p in each scenario."""
+        rng, n, z = np.random.default_rng(0), exposure.RATE_DRAWS, exposure.normal_quantile(self.confidence)
+        ends = np.zeros((2, n))
+        for (name, pair), side in zip(self.scenarios.items(), sides, strict=True):
+            counted, either = self.frequencies[name], pair.either.base_uncertainty
+            spread = 0.0 if either is None or not math.isfinite(either.spread) else either.spread
+            events = counted.per_km * np.exp(counted.log_sd * rng.standard_normal(n))
+            error, traffic = rng.standard_normal(n), np.exp(spread * rng.standard_normal(n))
+            if side.p > 0:
+                low, high = side.interval
+                away = np.where(error < 0, math.log(side.p / max(low, LEAST)), math.log(high / side.p))
+                ends += events * np.minimum(side.p * traffic * np.exp(away / z * error), 1.0)
+            else:
+                of_other = pair.b.p * pair.interval[1] if side is pair.a else pair.a.p / max(pair.interval[0], LEAST)
+                most = min(side.interval[1], of_other or 1.0)
+                ends[1] += events * np.minimum(most * traffic, 1.0)
+        tails = exposure.tail_levels(self.confidence)
+        low, high = (exposure.MILLION_KM * float(np.quantile(end, tail)) for end, tail in zip(ends, tails, strict=True))
+        return low, high
+
+    @property
+    def left_out(self) -> str:
+        """Why the error of a traffic model is not in the interval; empty if it is."""
+        for name, pair in self.scenarios.items():
+            known = pair.base_uncertainty
+            if pair.a.p > 0 and pair.b.p > 0 and known is not None and known.interval is None:
+                return f"{text.name_scenario(name)}: {known.reason.rstrip('.')}"
+        return ""
+
+    @property
+    def people(self) -> HumanBenchmark | None:
+        """Contacts of people in the same events together; None if those of one kind were not counted."""
+        kinds: list[str] = []
+        for name, pair in self.scenarios.items():
+            kinds += [part.name for part in pair.either.parts if part.name in COUNTED] or [name]
+        return add_people([count_people(kind) for kind in kinds])
+
+    @cached_property
+    def verdict(self) -> samplers.analysis.Verdict | None:
+        """Whether B has fewer than `max_ratio` times as many collisions as A; None without a limit."""
+        if self.max_ratio is None:
+            return None
+        doubt = find_doubt([each for each in self.warnings if RATIO_COARSE not in each])
+
+        def judge(exact: bool) -> samplers.analysis.Verdict:
+            ends = self.interval_if_exact if exact else self.interval
+            low, high = (math.inf if end == 0 else 1.0 / end for end in reversed(ends))
+            reason = "no failure of A or B was found" if math.isnan(self.ratio) else doubt
+            reason = reason or ("" if exact else self.left_out)
+            about: dict[str, Any] = {"quantity": "collisions of B / A", "includes_base": not exact}
+            return judge_ends(self.max_ratio or 0.0, (low, high), self.confidence, reason, **about)
+
+        found = judge(self.assume_traffic)
+        return replace(found, if_exact=None if self.assume_traffic else judge(True).decision)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -549,19 +635,64 @@ class RiskComparison:
         return tuple(f"{name}: {warning}" for name, warnings in named for warning in warnings)
 
     def __str__(self) -> str:
-        """Return the answer, for people: both rates, their ratio, and which egos fail in the same draws."""
-        rates, (low, high) = self.per_million_km, map(text.format_rate, self.interval)
+        """Return the answer, for people: the ratio, what limits it, both rates, and last the verdict."""
+        return "\n".join(self.describe())
+
+    def describe(self, last: Sequence[Row] = (), most: int = MOST_LINES) -> list[str]:
+        """Return the lines of the answer, at most so many; `last` are facts before the verdict."""
+        a, b = (Path(ego).name if Path(ego).suffix else ego for ego in (self.ego_a, self.ego_b))
+        gate, names = text.list_gate(self.verdict), " and ".join(map(text.name_scenario, self.scenarios))
+        title = textwrap.shorten(f"{a} (A) against {b} (B) in {names}", WIDTH, placeholder=" ...")
+        rows = [*self._list_facts(a, b), *list_warnings(self.warnings), *last]
+        return [title, *fold_rows(rows, most - 1 - len(gate)), *gate]
+
+    def _list_facts(self, a: str, b: str) -> list[Row]:
+        """Return the ratio, what limits it, the rate of each ego beside people, and what both share."""
+        rates, (low, high) = self.per_million_km, self.interval
+        pairs = [*self.scenarios.values()]
+        bases = [pair.base_uncertainty for pair in pairs if pair.base_uncertainty is not None]
+        n, known = f"{sum(pair.n_sim for pair in pairs):,}", self.left_out
+        about: dict[str, Any] = {"a": a, "b": b, "fails": "crashes", "sure": f"{100 * self.confidence:g} %"}
+        limit = say("limited by simulations", n=n, few="")
+        if self.ratio > 0 and math.isfinite(self.ratio) and high > UNLIMITED * low:
+            said = say("ratio without limits", ratio=format_alike(self.ratio)[0], **about)
+        elif self.ratio > 0 and math.isfinite(self.ratio) and low > 0 and math.isfinite(high):
+            ratio, *ends = format_alike(self.ratio, low, high)
+            said = say("ratio", ratio=ratio, low=ends[0], high=ends[1], **about)
+            said += say("undecided which", fails="crashes") if low <= 1 <= high else ""
+            events = ", ".join(dict.fromkeys(each.fitted_to for each in bases))
+            base = replace(bases[0], fitted_to=events) if bases else None
+            limit = describe_limit(self.ratio, self.interval_if_exact, (low, high), n, MODEL_NOUN, base)
+        elif math.isnan(self.ratio):
+            said = say("ratio not known", **about)
+        elif low > 0:
+            said = say("ratio to a safe one" if rates["b"] == 0 else "ratio above", low=format_alike(low)[0], **about)
+        else:
+            fact = "ratio of a safe one" if rates["a"] == 0 else "ratio below"
+            ratio, top = format_alike(self.ratio, high)
+            said = say(fact, ratio=ratio, high=top, **about)
+        counted, sides = text.describe_people(self.people), list[Row]()
+        for name, letter, own in ((a, "A", [each.a for each in pairs]), (b, "B", [each.b for each in pairs])):
+            rate_ends = self._find_rate_interval(own)
+            rate = text.format_with_interval(rates[letter.lower()], rate_ends, " per million km")
+            sides.append((name if len(name) < LABEL - 1 else letter, say("rate of all", rate=rate, people=counted)))
+        both, first, second = format_alike(rates["both"], rates["only_a"], rates["only_b"])
+        shares = f"{say('shares', both=both, a=a, first=first, b=b, second=second)} per million km"
+        left_out = known and say("error not known", model=MODEL_NOUN, reason=known)
+        rows = [("Ratio", said), ("Limited by", limit), ("Left out", left_out), *sides, ("Together", shares)]
+        return [row for row in rows if row[1]]
+
+    def details(self) -> str:
+        """Return a table by scenario, all that is known of each, and all warnings."""
         rows: list[tuple[str, ...]] = [("per million km", "A", "B", "both", "only A", "only B")]
         for name, pair in self.scenarios.items():
             alone = replace(self, scenarios={name: pair})
             rows.append((text.name_scenario(name), *map(text.format_rate, alone.per_million_km.values())))
-        if len(self.scenarios) > 1:
-            rows.append(("all", *map(text.format_rate, rates.values())))
-        level = f"{100 * next(iter(self.scenarios.values())).confidence:g} %"
-        ratio = f"{text.format_rate(self.ratio)} ({level}: {low} to {high})".replace("inf", "unlimited")
-        ratio = "not known, as neither failed" if math.isnan(self.ratio) else ratio
-        first = f"A = {self.ego_a}, B = {self.ego_b}: collisions of A / B {ratio}"
-        return "\n".join([first, *text.tabulate(rows), *(f"warning: {each}" for each in self.warnings)])
+        rows.append(("all", *map(text.format_rate, self.per_million_km.values())))
+        lines = text.tabulate(rows)
+        for name, pair in self.scenarios.items():
+            lines += ["", text.name_scenario(name), *pair.details().splitlines()]
+        return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; infinities and NaN become None."""
@@ -573,9 +704,11 @@ class RiskComparison:
             "ratio": ratio,
             "interval": [low, high],
             "per_million_km": dict(self.per_million_km),
+            "people": None if self.people is None else self.people.to_dict(),
             "scenarios": {name: pair.to_dict() for name, pair in self.scenarios.items()},
+            "gate": None if self.verdict is None else self.verdict.to_dict(),
             "warnings": list(self.warnings),
-            "text": str(self).splitlines(),
+            "text": self.describe(most=text.WHOLE),
             "version": __version__,
         }
 
@@ -621,20 +754,76 @@ def compare_risks(
         >>> found.per_million_km["a"], found.ratio
         (0.0, nan)
     """
-    folder = None if out is None else Path(out)
-    if folder is not None and not force:
-        check_no_results(folder, COMPARISON)
+    whole: dict[str, Any] = {
+        "command": SUM,
+        "ego_a": ego_a,
+        "ego_b": ego_b,
+        "scenarios": [*scenarios],
+        "site": site,
+        "bases": {name: str(base) for name, base in (bases or {}).items()},
+        "b": {"algo_b": algo_b, "stats_b": stats_b},
+        "chunked": executor is not None,
+        "options": {name: value for name, value in options.items() if name not in CHANGEABLE},
+    }
+    return _compare_sums(whole, None if out is None else Path(out), progress, force, executor, options)
+
+
+def resume_compared_risks(
+    folder: Path, questions: Mapping[str, Question], whole: Mapping[str, Any], **how: Any
+) -> RiskComparison:
+    """Continue an interrupted comparison of risks, as `resume_risk`."""
+    trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
+    for question in questions.values():
+        open_question(asdict(question), folder, trust)
+    options = {**whole["options"], "trust": trust, "device": first.device}  # the cores of A and B may differ
+    with as_bad_input(KeyError, TypeError, AttributeError):
+        return _compare_sums(dict(whole), folder, True, False, executor, options)
+
+
+def _compare_sums(
+    whole: dict[str, Any],
+    folder: Path | None,
+    progress: bool,
+    force: bool,
+    executor: Executor | None,
+    options: Mapping[str, Any],
+) -> RiskComparison:
+    """Compare two egos from checked arguments, `whole`, which the parts record."""
+    ego_a, ego_b, of_b = whole["ego_a"], whole["ego_b"], whole["b"]
     with as_bad_input(TypeError, ValueError):
-        chosen = _choose_scenarios(scenarios, [site], bases or {})
+        chosen = _choose_scenarios(whole["scenarios"], [whole["site"]], whole["bases"])
         asked = [Question(env_id=env_id, base=base, ego=ego_a, **options) for env_id, base in chosen.values()]
         frequencies = {name: find_frequency(prepare(each)) for name, each in zip(chosen, asked, strict=True)}
+    if folder is not None:
+        parts = {folder / name / side: each for name, each in zip(chosen, asked, strict=True) for side in SIDES}
+        if force:
+            clear_runs(parts)
+            for path in (folder, *(folder / name for name in chosen)):
+                (path / COMPARISON).unlink(missing_ok=True)
+                (path / FAILURES).unlink(missing_ok=True)
+        check_no_results(folder, COMPARISON)
+        for name in chosen:
+            if not any((folder / name / side / JOURNAL).exists() for side in SIDES):
+                check_no_results(folder / name, COMPARISON)
     with contextlib.nullcontext() if folder is None else output_folder(folder, COMPARISON, folders=chosen):
         pairs = {}
         for name, question in zip(chosen, asked, strict=True):
             part = None if folder is None else folder / name
-            pairs[name], _ = compare_egos(question, ego_b, progress, part, force, algo_b, stats_b, executor)
-        found = RiskComparison(ego_a=ego_a, ego_b=ego_b, scenarios=pairs, frequencies=frequencies)
+            how: dict[str, Any] = {**of_b, "executor": executor, "whole": whole}
+            pairs[name], _ = compare_egos(question, ego_b, progress, part, **how)
+        found = RiskComparison(
+            ego_a=ego_a,
+            ego_b=ego_b,
+            scenarios=pairs,
+            frequencies=frequencies,
+            max_ratio=asked[0].max_ratio,
+            assume_traffic=asked[0].assume_traffic,
+        )
         if folder is not None:
             with unwritten_results(folder, found):
                 replace_text(folder / COMPARISON, format_json(found.to_dict()) + "\n")
+            for side in parts:
+                (side / JOURNAL).unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # it has more
+                    side.rmdir()
     return found

@@ -46,6 +46,8 @@ from samplers.result import method_settings
 
 WHOLES = ("risk.json", "comparison.json", "estimate.safetensors")
 """Results of commands that are no single estimate."""
+SUM = "compare sums"
+"""Command of a comparison summed over scenarios: the folder of each has two journals, which stay to the end of all."""
 BEGIN_AGAIN = "give the command again."
 """Advice if there is nothing to continue."""
 
@@ -101,6 +103,8 @@ def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], 
 
     The command is empty for a single estimate; a folder of a part of a comparison means that of the comparison.
     """
+    if sums := sorted(path.parent for path in folder.glob(f"*/*/{run_folder.JOURNAL}")):
+        return _find_sum(folder, sums, mend)
     parts = [""] if (folder / run_folder.JOURNAL).exists() else []
     parts += [path.parent.name for path in sorted(folder.glob(f"*/{run_folder.JOURNAL}"))]
     whole, questions = dict[str, Any](), dict[str, Question]()
@@ -108,7 +112,7 @@ def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], 
         journal, questions[part] = continue_journal(folder / part, mend)
         found = dict(journal.head.get("whole") or {})
         journal.close()
-        if part == "" and found.get("command") == "compare":
+        if found.get("command") == SUM or (part == "" and found.get("command") == "compare"):
             return find_whole(folder.parent, mend)
         if part == "":
             return folder, found if found.get("command") == "estimate" else {}, questions
@@ -116,6 +120,18 @@ def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], 
             raise BadInput(f"{str(folder)!r} has several runs: continue each, such as {advise_resume(folder / part)}.")
         whole = found
     return folder, whole, questions
+
+
+def _find_sum(folder: Path, parts: Sequence[Path], mend: bool) -> tuple[Path, dict[str, Any], dict[str, Question]]:
+    """Return the same of a comparison that is summed over scenarios, of the folders of its journals."""
+    wholes, questions = list[dict[str, Any]](), dict[str, Question]()
+    for part in parts:
+        journal, questions[str(part)] = continue_journal(part, mend)
+        wholes.append(dict(journal.head.get("whole") or {}))
+        journal.close()
+    if wholes[0].get("command") != SUM or any(each != wholes[0] for each in wholes):
+        raise BadInput(f"{str(folder)!r} has several runs: continue each, such as {advise_resume(parts[0].parent)}.")
+    return folder, wholes[0], questions
 
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
@@ -183,10 +199,13 @@ def journals_of(
                     journal.remove()
                 raise
             trust = any(question.trust for question in questions.values())
-            again = f"{error} {kept:,} simulations are kept; go on with: {advise_resume(out, trust)}"
+            resumed = out.parent if whole["command"] == SUM else out
+            again = f"{error} {kept:,} simulations are kept; go on with: {advise_resume(resumed, trust)}"
             kind = RunInterrupted if isinstance(error, KeyboardInterrupt) else UnwrittenResults
             raise kind(again, getattr(error, "report", None)) from error
         for folder, journal in zip(parts, journals, strict=True):
+            if whole["command"] == SUM:
+                continue
             journal.remove()
             with contextlib.suppress(OSError):  # it has results
                 folder.rmdir()

@@ -25,7 +25,7 @@ from rare_envs.study.cli import shell
 from rare_envs.study.cli.shell import DOUBTFUL, Answer, command, describe_report
 
 if TYPE_CHECKING:
-    from rare_envs.study.risk import Risk
+    from rare_envs.study.risk import Risk, RiskComparison
     from samplers import Estimate
     from samplers.comparison import Comparison
     from samplers.executors import Executor
@@ -301,8 +301,8 @@ def risk_command(
     return tell(found, out)
 
 
-def _tell_risk(details: bool, found: Risk, out: Path | None = None) -> Answer:
-    """Return the answer of a risk."""
+def _tell_risk(details: bool, found: Risk | RiskComparison, out: Path | None = None) -> Answer:
+    """Return the answer of a risk, or of the comparison of two."""
     from rare_envs.study.text import list_gate
 
     code = DOUBTFUL if found.warnings else 0
@@ -336,44 +336,28 @@ def compare_command(
 
     env = env or asked.pop("env_id")
     if env is None:
-        return _compare_risks(ego_a, ego_b, {**asked, "algo_b": algo_b, "stats_b": stats_b}, out, force)
+        return _compare_risks(ego_a, ego_b, {**asked, "algo_b": algo_b, "stats_b": stats_b}, out, force, details)
     question, executor = _ask(env, {**asked, "max_sim": asked["max_sim"] or PAIR_SIMULATIONS}, ego=ego_a)
-    tell, b = partial(_tell_comparison, details), {"algo_b": algo_b, "stats_b": stats_b}
+    tell = partial(_tell_comparison, details)
+    b: dict[str, Any] = {"algo_b": algo_b, "stats_b": stats_b}
     with shell.telling_unwritten(tuple, tell):
         pair = compare_egos(question, ego_b, progress=True, out=out, force=force, executor=executor, **b)
     return tell(pair, out)
 
 
-def _compare_risks(ego_a: str, ego_b: str, asked: dict[str, Any], out: Path | None, force: bool) -> Answer:
+def _compare_risks(
+    ego_a: str, ego_b: str, asked: dict[str, Any], out: Path | None, force: bool, details: bool
+) -> Answer:
     """Compare two egos in the scenarios of risk."""
     from rare_envs.study.risk import SCENARIO_SET, RiskComparison, compare_risks
-    from rare_envs.study.text import list_gate
-    from samplers.analysis.gate import find_doubt, judge_ends
-    from samplers.comparison import RATIO_COARSE
 
-    if asked["assume_traffic"]:
-        raise BadInput("Expected one scenario with --assume-traffic: rare-envs compare EGO_A EGO_B CutIn.")
-    executor, base = _make_executor(asked), asked.pop("base")
+    executor, base, tell = _make_executor(asked), asked.pop("base"), partial(_tell_risk, details)
     options = {name: value for name, value in asked.items() if name not in (*shell.EXECUTOR, "env_id")}
     options |= {"bases": _read_bases([base] if base else [], SCENARIO_SET)}
     options |= {"max_sim": asked["max_sim"] or PAIR_SIMULATIONS, "executor": executor}
-
-    def tell(found: RiskComparison, *wrote: str) -> Answer:
-        verdict, code = None, DOUBTFUL if found.warnings else 0
-        if (limit := asked["max_ratio"]) is not None:
-            ends = (found.interval[1], found.interval[0])
-            low, high = (math.inf if end == 0 else 1.0 / end for end in ends)
-            about: dict[str, Any] = {"quantity": "collisions of B / A", "includes_base": True}
-            confidence = 2.0 * asked["confidence"] - 1.0
-            doubt = find_doubt([each for each in found.warnings if RATIO_COARSE not in each])
-            verdict = judge_ends(limit, (low, high), confidence, doubt, **about)
-            code = GATE_CODES[verdict.decision]
-        data = {**found.to_dict(), "gate": None if verdict is None else verdict.to_dict()}
-        return Answer(data, "\n".join([str(found), *wrote, *list_gate(verdict)]), code)
-
     with as_bad_input(ValueError), shell.telling_unwritten(RiskComparison, tell):
         found = compare_risks(ego_a, ego_b, out=out, progress=True, force=force, **options)
-    return tell(found, *([] if out is None else [f"Wrote {out}."]))
+    return tell(found, out)
 
 
 def _tell_comparison(details: bool, pair: tuple[Comparison, dict[str, Any]], out: Path | None = None) -> Answer:
@@ -418,7 +402,11 @@ def resume_command(
     if whole["command"] == "compare":
         with shell.telling_unwritten(tuple, partial(_tell_comparison, details)):
             return _tell_comparison(details, evaluate.resume_comparison(folder, questions, trust, executor), folder)
-    from rare_envs.study.risk import Risk, resume_risk
+    from rare_envs.study.risk import Risk, RiskComparison, resume_compared_risks, resume_risk
 
+    if whole["command"] == writing.SUM:
+        with as_bad_input(ValueError), shell.telling_unwritten(RiskComparison, partial(_tell_risk, details)):
+            compared = resume_compared_risks(folder, questions, whole, trust=trust, executor=executor)
+            return _tell_risk(details, compared, folder)
     with as_bad_input(ValueError), shell.telling_unwritten(Risk, partial(_tell_risk, details)):
         return _tell_risk(details, resume_risk(folder, questions, whole, trust=trust, executor=executor), folder)

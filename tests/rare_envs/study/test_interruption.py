@@ -146,6 +146,25 @@ def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monke
     assert_stopped(cli(*words), "Stopped: no estimate yet, the first batch of simulations was not complete.")
 
 
+@pytest.mark.slow
+def test_a_sum_of_comparisons_goes_on_in_the_scenario_that_was_stopped(
+    cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", "idm", "cc_human", "--method", "mc", "--max-sim", "20000", "--seed", "0", "--max-ratio", "2")
+    with monkeypatch.context() as patch:
+        stop_after(30_000, patch)
+        result = cli(*words, "--out", "both")
+    assert result.exit_code == 143
+    assert "simulations are kept; go on with: rare-envs resume both\n" in result.stderr
+    assert Path("both/cut_in/comparison.json").exists() and not Path("both/comparison.json").exists()
+    resumed = cli("resume", "both", "--json")
+    assert resumed.exit_code == 5, resumed.stderr
+    both = json.loads(resumed.stdout)
+    assert both == json.loads(cli(*words, "--out", "whole", "--json").stdout)
+    assert both == json.loads(Path("both/comparison.json").read_text()) and both["gate"]["decision"] == "undecided"
+    assert not [*Path("both").glob("**/journal.bin")]
+
+
 def test_a_full_disk_in_mid_run_counts_each_simulation_once(
     cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

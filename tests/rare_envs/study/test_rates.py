@@ -380,7 +380,9 @@ def test_two_egos_are_compared_by_their_sums_over_scenarios() -> None:
     assert low < 1.0 < high
     alone = add_up(cut_in=([0, 1, 2, 3], [0, 4]))
     assert alone.interval == pytest.approx(alone.scenarios["cut_in"].interval, rel=0.1)
-    row = next(line.split() for line in str(found).splitlines() if line.startswith("all "))
+    lines = str(found).splitlines()
+    assert len(lines) <= 12 and max(map(len, lines)) < 100 and lines[1].startswith("Ratio        a crashes 1.0 times")
+    row = next(line.split() for line in found.details().splitlines() if line.startswith("all "))
     assert row == ["all", "40,000", "40,000", "10,000", "30,000", "30,000"]
 
 
@@ -392,7 +394,11 @@ def test_without_failures_of_one_ego_the_ratio_of_sums_has_one_limit() -> None:
     assert below.ratio == below.interval[0] == 0.0
     assert below.interval[1] == pytest.approx(1.0 / above.interval[0], rel=0.1)
     assert neither.interval == (0.0, float("inf"))
-    assert "not known, as neither failed" in str(neither)
+    assert "not known: no failure of a or b found" in str(neither)
+    assert "a crashes more than 11 times as often as b (95 %)" in str(above)
+    limited = [replace(each, max_ratio=1.0).verdict for each in (above, below, neither)]
+    assert [each.decision for each in limited if each is not None] == ["passes", "fails", "undecided"]
+    assert str(replace(above, max_ratio=1.0)).splitlines()[-1].startswith("GATE passes")
     assert above.to_dict()["ratio"] is neither.to_dict()["ratio"] is None
 
 
@@ -406,4 +412,5 @@ def test_compare_without_a_scenario_sums_over_those_of_risk(cli: Any, tmp_path: 
     assert list(found["scenarios"]) == ["cut_in", "hard_brake"]
     assert found["scenarios"]["cut_in"]["shares"]["neither"] == 1.0
     assert "finished run" in cli(*words, "--out", tmp_path / "pair").stderr
-    assert "Expected a scenario with --max-ratio" in cli(*words, "--max-ratio", 1).stderr
+    gated = cli(*words, "--max-ratio", 1)
+    assert gated.exit_code == 5 and gated.stdout.splitlines()[-1].startswith("GATE undecided (exit code 5)")
