@@ -260,13 +260,15 @@ def _make_model(
 ) -> Any:
     """Return a new model; ReLU is the activation of its networks unless `policy` names another."""
     import stable_baselines3
-    from gymnasium.spaces import Dict
+    from gymnasium.spaces import Dict, Discrete
     from stable_baselines3.common.preprocessing import is_image_space
     from torch import nn
 
     space = env.observation_space
     name = "MultiInputPolicy" if isinstance(space, Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
     device = device if name != "MlpPolicy" else "cpu"  # on which small networks learn sooner, as SB3 says too
+    if isinstance(env.action_space, Discrete) and not (HYPERPARAMETERS[algo].discrete or algo in ("ppo", "a2c")):
+        raise ValueError(f"Expected continuous actions (--action) with {algo}; ppo, a2c and dqn take discrete ones.")
     algorithm = getattr(stable_baselines3, algo.upper())  # its classes are named so
     policy = {"activation_fn": nn.ReLU, **policy}
     return algorithm(name, env, policy_kwargs=policy, seed=seed, device=device, **settings)

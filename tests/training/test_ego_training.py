@@ -86,6 +86,7 @@ def test_bad_requests_are_refused_before_work(tmp_path: Path, monkeypatch: pytes
         ({"steps": 0}, "steps >= 1, got 0"),
         ({"env_id": "CutInn-v1", "out": "new/ego"}, "did you mean 'rare_envs/CutIn-v1'"),
         ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
+        ({"algo": "sac", "action": "discrete"}, "Expected continuous actions .* with sac; ppo, a2c and dqn take"),
         ({"num_envs": 0}, "num_envs >= 1, got 0"),
         ({"out": "."}, "got the folder"),
         ({"out": "file/ego.zip"}, "Cannot make the folder"),

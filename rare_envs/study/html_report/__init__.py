@@ -364,6 +364,9 @@ def _describe_comparison(folder: Path, trust: bool) -> dict[str, Any]:
     """Return what the page says of a comparison: its ratio, and the most likely failures as both egos drive them."""
     with as_bad_input(OSError, ValueError):
         found = parse_json_object(read_text_file(folder / COMPARISON), COMPARISON)
+        if "question" not in found and isinstance(found.get("scenarios"), dict):
+            parts = ", ".join(str(folder / str(name)) for name in found["scenarios"])
+            raise ValueError(f"{str(folder)!r} sums several comparisons: expected the folder of one, {parts}.")
         table = read_failures(folder)
     questions = [open_question(each, folder, trust) for each in split_question(found.get("question"))]
     problems = [prepare(question).problem for question in questions]
