@@ -232,9 +232,9 @@ class EventCalibration:
         """Return the factor by which a driver misses people's interval per event; see `ModelCount.factor_from`."""
         return self.drivers[driver][outcome].factor_from(*self.people(outcome)[1])
 
-    def describe_factor(self) -> str:
+    def describe_factor(self, outcome: Outcome = "contacts") -> str:
         """Return the factor, as "7.5 times above people's interval", or that it may be so if nothing was counted."""
-        factor, count = self.factor(), self.drivers["human"]["contacts"]
+        factor, count = self.factor(outcome), self.drivers["human"][outcome]
         if factor == 1.0:
             return "inside people's interval"
         way = f"{factor:.2g} times above" if factor > 1.0 else f"{1.0 / factor:.2g} times below"

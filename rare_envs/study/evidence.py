@@ -31,14 +31,14 @@ from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, list_co
 from rare_envs.study.export import export_drive
 from rare_envs.study.question import Study, open_run, prepare
 from rare_envs.study.replay import REPLAY_TOLERANCE, Drive, drive_again, read_row
-from rare_envs.study.run_folder import RESULT, RISK, LoadedStudy, load_finished
+from rare_envs.study.run_folder import EVIDENCE, RESULT, RISK, LoadedStudy, load_finished
 from rare_envs.study.text import describe_kind, format_probability, format_rate
+from rare_envs.study.writing import remove_evidence
 from samplers.output import to_json_value
+from samplers.problem import FloatArray
 
 __all__ = ["EVIDENCE", "SCHEMA", "Leaf", "judge_leaf", "write_evidence"]
 
-EVIDENCE = "evidence"
-"""Folder in that of the run."""
 COVERAGE, UNCERTAINTY, VALIDATION = "coverage.json", "uncertainty.json", "validation.json"
 TRAFFIC, TEST_CASES, MANIFEST, CLAIMS = "traffic.json", "test_cases.json", "manifest.json", "claims.json"
 FILES = (COVERAGE, UNCERTAINTY, VALIDATION, TRAFFIC, TEST_CASES, MANIFEST, CLAIMS)
@@ -51,6 +51,8 @@ N_COMPARED = 1_000
 """Ordinary scenarios that both simulators drive."""
 MOST_CASES = 20
 """Test cases at most."""
+ENOUGH_COV = 0.3
+"""Largest relative standard error of p at which the simulations are called enough."""
 CHECK_TAIL = 0.025
 """A recorded count is outside what the traffic model expects if a count as extreme has a smaller probability."""
 
@@ -97,7 +99,7 @@ class Leaf:
     def judge(self, content: Mapping[str, Any]) -> Status:
         """Return whether the content of the file supports the claim."""
         value = self.read(content)
-        if value is None:
+        if value in (None, ""):
             return "not known"
         right = value <= self.limit if self.rule == "at most" else self.rule == "known" or value == self.limit
         return "supported" if right else "not supported"
@@ -145,8 +147,9 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
         BadInput: There is no finished run, it may not be driven again, or a file cannot be written.
     """
     if (folder / RISK).is_file():
-        runs = sorted(path.parent for path in folder.glob(f"*/{RESULT}"))
-        return tuple(path for run in runs for path in _write_evidence_of_run(run, trust))
+        with as_bad_input(OSError, ValueError):
+            names = parse_json_object(read_text_file(folder / RISK), repr(str(folder / RISK))).get("scenarios") or ()
+        return tuple(path for name in names for path in _write_evidence_of_run(folder / str(name), trust))
     return _write_evidence_of_run(folder, trust)
 
 
@@ -156,6 +159,7 @@ def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Path, ...]:
     prepared = prepare(open_run(study, trust))
     out = folder / EVIDENCE
     with output_folder(out, PAGE, *FILES, folders=("test_cases",)), as_bad_input(OSError, ValueError):
+        remove_evidence(folder)
         rows = list_failures(study)
         drives = [drive_again(prepared.problem, read_row(study.failures, prepared.problem, row)) for row in rows]
         content: dict[str, dict[str, Any]] = {
@@ -180,7 +184,8 @@ def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Path, ...]:
 def list_failures(study: LoadedStudy) -> list[int]:
     """Return the rows of failures.csv for test cases: the most likely of each mode, then the next most likely."""
     of_modes = [mode["failure"] for mode in study.result.get("modes") or [] if mode.get("failure") is not None]
-    return list(dict.fromkeys([*of_modes, *range(len(study.failures["f"]))]))[:MOST_CASES]
+    rows = dict.fromkeys([*of_modes, *range(len(study.failures["f"]))])
+    return [row for row in rows if not np.isnan(study.failures["f"][row])][:MOST_CASES]  # the ego gave an answer
 
 
 def describe_coverage(study: Study) -> dict[str, Any]:
@@ -242,6 +247,8 @@ def list_uncertainty(result: Mapping[str, Any]) -> dict[str, Any]:
             "people_per_million_km": (each.get("people") or {}).get("interval_per_million_km"),
             "human_model_factor": (each.get("calibration") or {}).get("factor"),
             "uncalibrated": each.get("uncalibrated"),
+            # a factor of nothing says nothing
+            "calibrated": not each["uncalibrated"] if (each.get("people") or {}).get("count") else None,
         }
         for each in events
     ]
@@ -271,28 +278,32 @@ def validate(study: LoadedStudy, prepared: Study, rows: Sequence[int], drives: S
             "what": "failures of the run, driven again one by one with every moment kept",
             "compared": len(rows),
             "differing": differing if len(rows) else None,
+            "without_answer_of_the_ego": int(np.isnan(study.failures["f"]).sum()),
             "largest_difference_of_f": float(np.abs(found - recorded).max()) if len(rows) else None,
             "tolerance": REPLAY_TOLERANCE,
         },
-        "simulators": compare_simulators(prepared),
+        "simulators": compare_simulators(prepared, [read_row(study.failures, prepared.problem, row) for row in rows]),
         "files_changed": study.changed_files,
     }
 
 
-def compare_simulators(study: Study) -> dict[str, Any]:
-    """Return how far the compiled simulator and the one of torch agree in ordinary scenarios."""
-    about: dict[str, Any] = {"what": "the same ordinary scenarios by the compiled simulator and by torch"}
+def compare_simulators(study: Study, failures: Sequence[FloatArray]) -> dict[str, Any]:
+    """Return how far the compiled simulator and the one of torch agree, in failures and in ordinary scenarios."""
+    about: dict[str, Any] = {"what": "failures and ordinary scenarios by the compiled simulator and by torch"}
     if study.problem.core != "numba" or study.problem.varies:
         reason = "the ego's answers vary" if study.problem.varies else "this question is simulated by torch alone"
-        return {**about, "compared": 0, "collisions_differing": None, "reason": reason}
+        return {**about, "compared": 0, "failures_differing": None, "reason": reason}
     x = study.problem.space.sample(N_COMPARED, np.random.default_rng(study.question.seed))
+    x = np.vstack([x, *failures])
     other = prepare(replace(study.question, core="torch", device="cpu"), study.problem.ego).problem
     compiled, reference = study.problem.evaluate(x), other.evaluate(x)
-    gamma = study.question.gamma
+    fail = [f <= study.question.gamma for f in (compiled, reference)]
+    either = int(np.sum(fail[0] | fail[1]))
     return {
         **about,
         "compared": len(x),
-        "collisions_differing": int(np.sum((compiled <= gamma) != (reference <= gamma))),
+        "failing_in_either": either,
+        "failures_differing": int(np.sum(fail[0] != fail[1])) if either else None,
         "largest_difference_of_f": float(np.abs(compiled - reference).max()),
         "reason": "",
     }
@@ -399,23 +410,25 @@ def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
         top = f"{ego} collides at most {most} times per million km in {env_id} ({level})"
     evidence = f"{EVIDENCE}/"
     events = result.get("events") or []
-    calibrated = Leaf(RESULT, "/events/0/uncalibrated", "equals", "")
     goals: dict[str, list[tuple[str, Leaf]]] = {
         "S1 Argue over each source of uncertainty": [
-            ("Enough simulations: p has an interval", Leaf(RESULT, "/interval/1", "known")),
-            ("No missed crash type is likelier than the upper limit", Leaf(RESULT, "/unseen", "at most", high)),
+            (
+                f"Enough simulations: relative error of p at most {ENOUGH_COV:g}",
+                Leaf(RESULT, "/cov", "at most", ENOUGH_COV),
+            ),
+            ("A crash type that was missed is rarer than the upper limit", Leaf(RESULT, "/unseen", "at most", high)),
             ("Recorded events limit p", Leaf(evidence + UNCERTAINTY, "/sources/2/interval_of_p/1", "known")),
             *[
                 (
-                    f"A human driver model crashes as often as people do ({each['event']})",
-                    replace(calibrated, pointer=f"/events/{number}/uncalibrated"),
+                    f"A human driver model is within a factor 3 of people's interval ({each['event']})",
+                    Leaf(evidence + UNCERTAINTY, f"/calibration/{number}/calibrated", "equals", True),
                 )
                 for number, each in enumerate(events)
             ],
         ],
         "S2 Argue over the tool chain": [
             ("Failures replay", Leaf(evidence + VALIDATION, "/replays/differing", "equals", 0)),
-            ("Two simulators agree", Leaf(evidence + VALIDATION, "/simulators/collisions_differing", "equals", 0)),
+            ("Two simulators agree", Leaf(evidence + VALIDATION, "/simulators/failures_differing", "equals", 0)),
             ("The traffic model expects what was recorded", Leaf(evidence + TRAFFIC, "/checks_outside", "equals", 0)),
             ("The run has no warning", Leaf(RESULT, "/doubtful", "equals", False)),
         ],

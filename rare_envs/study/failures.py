@@ -486,7 +486,8 @@ def drive_by_others(study: Study, estimate: samplers.Estimate, kinds: CrashKinds
     for mode in kinds.modes:
         rows = slice(first, first := first + len(mode.drawn))
         fails = {name: float(np.mean(each[rows] <= estimate.gamma)) for name, each in f.items()}
-        n = len(np.unique(mode.drawn, axis=0))
+        counts = np.unique(mode.drawn, axis=0, return_counts=True)[1]
+        n = round(counts.sum() ** 2 / (counts**2).sum()) if len(counts) else 0  # effective, as a heavy one comes often
         modes.append(replace(mode, others={name: OtherDriver(share, n) for name, share in fails.items()}))
     of_list = {name: np.full(len(estimate.failures), np.nan) for name in f}
     for name, each in f.items():

@@ -228,8 +228,8 @@ def _explain_calibration(events: Sequence[Mapping[str, Any]]) -> list[str]:
             f"In {' and '.join(far)} the human driver model was not compared with people, or does not crash as often "
             "as they do: compare egos by this rate, and do not read it as a forecast."
         ]
-    near = f"within a factor {people.CALIBRATED_WITHIN:g}"
-    return [f"In these events the human driver model crashes as often as people, {near}."] if events else []
+    near = f"within a factor {people.CALIBRATED_WITHIN:g} of people's interval"
+    return [f"In these events the crash rate of the human driver model is {near}."] if events else []
 
 
 def explain_risk(risk: Result) -> list[str]:

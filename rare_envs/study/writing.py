@@ -230,7 +230,15 @@ def _remove_results(folder: Path) -> None:
     """Remove the results of an earlier run."""
     for name in run_folder.RESULT_FILES:
         (folder / name).unlink(missing_ok=True)
+    remove_evidence(folder)
     _remove_drafts(folder)
+
+
+def remove_evidence(folder: Path) -> None:
+    """Remove the files of evidence of an earlier run, or of an earlier call."""
+    for pattern in run_folder.EVIDENCE_FILES:
+        for path in (folder / run_folder.EVIDENCE).glob(pattern):
+            path.unlink()
 
 
 def _remove_drafts(folder: Path) -> None:

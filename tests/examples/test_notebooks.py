@@ -22,7 +22,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 """What the cell of settings is followed by, for each notebook."""
 SHOWN = {
-    "samplers_without_cars": ("P[f <= 0] ", "two-stage  p =", "importance of the parameters"),
+    "samplers_without_cars": ("P[f <= 0] ", "two-stage  p =", "importance (relative entropy"),
     "train_and_estimate": ("P[f <= 0] ", "collide: p in"),
     "your_own_data": ("40 cut-ins", "collisions per million km", "40 + 40 events"),
     "your_own_ego": ("P[f <= 0] ", "Ratio        A fails ", " 0.1 ", " 1e-06 "),

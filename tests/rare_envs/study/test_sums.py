@@ -55,7 +55,7 @@ def test_a_killed_run_of_a_sum_goes_on_to_the_same_parts(tmp_path: Path, braking
     assert [part["name"] for part in whole["parts"]] == ["slowing", "stop"] and whole["p"] > 0
 
 
-@pytest.mark.parametrize("resumes", [True, False])
+@pytest.mark.parametrize("resumes", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_risk_that_was_stopped_is_resumed_or_goes_on_with_the_same_command(
     resumes: bool, tmp_path: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
