@@ -171,7 +171,8 @@ def test_an_attentive_driver_does_again_what_it_did_and_avoids_what_a_coasting_e
         assert ("avoids" in done.stdout) == (ego != "human")
         for name, each in result["other_drivers"].items():  # every failure weighs the same, and is in the list
             assert each["fails"] == pytest.approx(np.mean(listed[f"f_{name}"] <= result["gamma"]), abs=0.03)
-            assert each["n"] == result["n_failures"]
+            # effective, from draws of failures that weigh the same
+            assert 0.8 * result["n_failures"] < each["n"] <= result["n_failures"]
         assert result["n_sim"] == 200 and result["n_other_drivers"] >= 200 * len(result["other_drivers"])
         for parts in (result["modes"], result["kinds"].values()):
             weighed = sum(part["of_failures"] * part["other_drivers"]["human"]["fails"] for part in parts)
