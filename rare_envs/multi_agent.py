@@ -203,8 +203,7 @@ def step_agents(
     """Carry out decisions (B, N, 2), or meta-actions (B, N), as `rare_envs.simulation.decision.advance` does for one.
 
     The ego's driver, with its memory, drives the ego where it is not commanded (B, N). Return the episodes at the time
-    of the next decision, rewards by vehicle, means over the ticks of which those after its collision count as 0, and
-    the memory.
+    of the next decision, rewards by vehicle, as of `run_ticks`, and the memory.
     """
 
     def tick(before: MultiAgentEpisode, chosen: Tensor, first: bool) -> tuple[MultiAgentEpisode, Any]:

@@ -31,6 +31,8 @@ ANSWER_TIME = 1.0
 """T, after which the vehicle behind brakes [s]. Assumed."""
 POWER = 4
 """How sharply drivers refuse. Assumed; 2 in its place moves contacts by a factor of 1.5 to 2."""
+ROUNDING = 1e-9
+"""Closing speeds this far [m/s] beyond an end are at it."""
 CLOSING_STEP = 0.25
 """Width of the panels of closing speeds [m/s]; at 1 m/s, where the least gap of 1 m is refused, one begins."""
 GAP_PANELS = 20
@@ -240,7 +242,9 @@ class AcceptedGaps:
     def _to_closing(self, x: FloatArray) -> FloatArray:
         """Return points with the closing speed; rounding of a difference does not lead out of its range."""
         z, within = x.copy(), self.mixture.coordinates.within[0]
-        z[:, self._speed] = x[:, self._ego] - x[:, self._speed]
+        closing = x[:, self._ego] - x[:, self._speed]
+        inner = np.clip(closing, *(end[self._speed] for end in self.mixture.coordinates.ends))
+        z[:, self._speed] = np.where(np.abs(closing - inner) < ROUNDING, inner, closing)
         outside = (x[:, self._speed] < within.least) | (x[:, self._speed] > within.most)
         least, most = z[:, self._speed] + within.least, z[:, self._speed] + within.most
         z[:, self._ego] = np.where(outside, x[:, self._ego], np.clip(x[:, self._ego], least, most))
@@ -262,7 +266,7 @@ class AcceptedGaps:
     @cached_property
     def _closing(self) -> _Closing:
         """The distribution of the closing speed."""
-        top = float(self.mixture.high[self._speed])
+        top = float(self.mixture.coordinates.ends[1][self._speed])
         edges = np.append(np.arange(0.0, top, CLOSING_STEP), top)
         z = np.zeros((GAP_PANELS // 2 * (len(edges) - 1), self.dim))
         z[:, self._speed] = _nodes_of(edges[:-1], edges[1:]).ravel()

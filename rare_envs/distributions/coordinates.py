@@ -152,13 +152,18 @@ class Coordinates:
         """Return whether the coordinate of column j is its logarithm; any other is linear in the column."""
         return self.kinds[j] == "log"
 
-    def bounds(self, j: int, x: FloatArray) -> tuple[Any, Any]:
-        """Return the ends, numbers or (n,), of the coordinate of column j in rows x whose earlier columns are set."""
+    def range_of(self, j: int, x: FloatArray) -> tuple[Any, Any]:
+        """Return the ends, numbers or (n,), of column j itself in rows x whose earlier columns are set."""
         ends = self.ends[0][j], self.ends[1][j]
         for each in self.within:
             if self.names[j] == each.column:
                 other = np.ascontiguousarray(x[:, self.names.index(each.earlier)])
                 ends = np.maximum(ends[0], other + each.least), np.minimum(ends[1], other + each.most)
+        return ends
+
+    def bounds(self, j: int, x: FloatArray) -> tuple[Any, Any]:
+        """Return the ends, numbers or (n,), of the coordinate of column j in rows x whose earlier columns are set."""
+        ends = self.range_of(j, x)
         if self.rises(j):
             origin = self.origins[j]
             return (np.log(ends[0] - origin), np.log(ends[1] - origin)) if self.is_log(j) else ends
@@ -167,10 +172,10 @@ class Coordinates:
 
     def contains(self, x: FloatArray) -> NDArray[np.bool_]:
         """Return which columns of points are in their ranges, (n, d) -> (n, d)."""
-        inside = (x >= self.low) & (x <= self.high)
-        for each in self.within:
-            j, other = self.names.index(each.column), x[:, self.names.index(each.earlier)]
-            inside[:, j] &= (x[:, j] >= other + each.least) & (x[:, j] <= other + each.most)
+        inside = (x >= self.ends[0]) & (x <= self.ends[1])
+        for j in {self.names.index(each.column) for each in self.within}:
+            low, high = self.range_of(j, x)
+            inside[:, j] = (x[:, j] >= low) & (x[:, j] <= high)
         return inside
 
     def coordinate(self, j: int, x: FloatArray) -> FloatArray:
@@ -204,7 +209,7 @@ class Coordinates:
         return np.stack([np.clip(self.coordinate(j, inner), *self.bounds(j, inner)) for j in self.columns], axis=1)
 
     def interior(self, x: FloatArray) -> FloatArray:
-        """Return points with those on a face moved off it, by one float, and those beyond the `ends` to these."""
+        """Return points with those on a face moved off it, by one float."""
         return move_inside(x, *self.ends)
 
     def to_dict(self) -> dict[str, Any]:
@@ -271,7 +276,7 @@ class Coordinates:
             )
 
     def _check_differences(self) -> None:
-        """Raise a ValueError unless differences are of columns in their order."""
+        """Raise a ValueError unless differences are of columns in their order, and leave each column a range."""
         for each in self.within:
             known = [self.names[j] for j in self.columns] if self.names else []
             later = known[known.index(each.earlier) + 1 :] if each.earlier in known else []
@@ -279,6 +284,10 @@ class Coordinates:
                 raise ValueError(f"Expected within of a column after {each.earlier!r} in order, got {each.column!r}.")
             if not each.least < each.most:
                 raise ValueError(f"Expected a range of {each.column} - {each.earlier}, got {each.least}, {each.most}.")
+        low, high = self.ends
+        if (low >= high).any():
+            j = int(np.argmax(low >= high))
+            raise ValueError(f"within leaves {self.names[j]} no range: from {low[j]:g} to {high[j]:g}.")
 
     def _check_kind(self, what: str, j: int, kind: object) -> None:
         """Raise a ValueError unless the kind of column j, `what` in messages, is known and fits the others."""

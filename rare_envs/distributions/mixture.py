@@ -73,10 +73,11 @@ class MappedMixture:
         points = self.read_rows("x", x)
         outside = ~self.coordinates.contains(points)
         if outside.any():
-            i, j = np.argwhere(outside)[0]
+            i, j = map(int, np.argwhere(outside)[0])
+            low, high = (float(np.squeeze(end)) for end in self.coordinates.range_of(j, points[i : i + 1]))
             raise ValueError(
-                f"x[{i}, {j}] = {points[i, j]:g} is outside the box [{self.low[j]:g}, {self.high[j]:g}] of coordinate "
-                f"{j}; only points in the box have an image."
+                f"x[{i}, {j}] = {points[i, j]:g} is outside the range [{low:g}, {high:g}] of coordinate {j} there; "
+                "only points in their ranges have an image."
             )
         return self._by_chunks(self._to_normal, self.coordinates.interior(points))
 
@@ -125,7 +126,7 @@ class MappedMixture:
     def _set(self, j: int, column: TruncatedConditional, y: FloatArray, x: FloatArray) -> None:
         """Set column j of rows x to what belongs to its coordinate y (n,), inside the box."""
         value = self.coordinates.value(j, move_inside(y, column.low, column.high), x)
-        x[:, j] = move_inside(value, self.low[j], self.high[j])
+        x[:, j] = move_inside(value, *(end[j] for end in self.coordinates.ends))
 
     def _conditionals(self, x: FloatArray) -> Iterator[tuple[int, TruncatedConditional]]:
         """Yield columns and their distributions given the earlier ones of x (n, d), which may be set on the way."""
@@ -272,7 +273,7 @@ class TruncatedGaussianMixture(MappedMixture):
         return (self,)
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
-        """Return the log density, (n, d) -> (n,); -inf outside the box.
+        """Return the log density, (n, d) -> (n,); -inf outside the box, and where `Coordinates.ends` leave no draws.
 
         Raises:
             ValueError: Wrong shape.

@@ -1,4 +1,4 @@
-"""A decision of one agent or of several: an action, the ticks until the next, and the mean of their rewards.
+"""A decision of one agent or of several: an action, the ticks until the next, and their rewards.
 
 The reward is what egos are trained on; estimates do not depend on it.
 """
@@ -119,7 +119,7 @@ def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
 
 
 def quantities_of(episode: Episode, action: Tensor) -> SimpleNamespace:
-    """Return what a reward of your own may depend on: of the ego after a tick, NumPy arrays of shape (B,).
+    """Return what a reward of your own may depend on: of the ego after a tick, NumPy arrays of shape (B,) of its own.
 
     speed [m/s]; heading, relative to the road, positive to the right [rad]; acceleration [m/s^2] and steering [rad]
     that the action (B, 2) asks for; of the vehicle ahead gap, bumper to bumper [m], closing_speed [m/s] and ttc [s],
@@ -138,7 +138,7 @@ def quantities_of(episode: Episode, action: Tensor) -> SimpleNamespace:
         "lane_offset": _lane_offset(episode),
         "collision": episode.collided,
     }
-    return SimpleNamespace(**{name: each.numpy(force=True) for name, each in found.items()})
+    return SimpleNamespace(**{name: each.numpy(force=True).copy() for name, each in found.items()})
 
 
 EgoReward: TypeAlias = Callable[[Episode, Tensor], Any]
@@ -183,6 +183,8 @@ def find_reward(reward: Any) -> EgoReward:
 def _weigh(given: Mapping[str, Any]) -> EgoReward:
     """Return the reward with these weights of `TERMS`, their names with HighwayEnv's ending or without."""
     weights = {str(name).removesuffix("_reward"): weight for name, weight in given.items()}
+    if len(weights) < len(given):
+        raise ValueError(f"Expected each term of the reward once, got {', '.join(map(repr, given))}.")
     for name, weight in weights.items():
         check_name("term of the reward", name, TERMS)
         if not isinstance(weight, Real) or not math.isfinite(weight):
@@ -229,13 +231,18 @@ Tick = Callable[[EpisodesT, Tensor, bool], tuple[EpisodesT, Sequence[tuple[Any, 
 reward, a tensor (B,) or a named tuple of such, and which had collided before and earn nothing, boolean (B,)."""
 
 
+ONCE = ("collision", "fault")
+"""Terms that count once in a decision, however many ticks it has: of what happens in a single one."""
+
+
 def run_ticks(
     clock: Clock, episodes: EpisodesT, action: Tensor, tick: Tick[EpisodesT]
 ) -> tuple[EpisodesT, tuple[Any, ...]]:
     """Carry out the ticks of a decision; no further ones once all have collided.
 
     Meta-actions are given in the first tick, `IDLE` in those after it; a physical action in all of them. Return the
-    episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0.
+    episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0,
+    and of terms in `ONCE` the sums.
     """
     stride = clock.stride
     episodes, rewards = tick(episodes, action, True)
@@ -252,7 +259,13 @@ def run_ticks(
             map_leaves(lambda old, new, over=over: old + new.masked_fill(over, 0.0), total, terms)
             for total, (terms, over) in zip(sums, rewards, strict=True)
         )
-    return episodes, tuple(map_leaves(lambda total: total / stride, terms) for terms in sums)
+    means = (map_leaves(lambda total: total / stride, terms) for terms in sums)
+    return episodes, tuple(
+        mean._replace(**{name: getattr(terms, name) for name in ONCE if name in terms._fields})  # by their names
+        if hasattr(terms, "_fields")
+        else mean
+        for mean, terms in zip(means, sums, strict=True)
+    )
 
 
 class StepResult(NamedTuple):
@@ -261,7 +274,7 @@ class StepResult(NamedTuple):
     episode: Episode
     """After it; those with a collision stay as they were in its tick."""
     terms: Any
-    """Terms of the reward, or the reward, shape (B,) each: means over the ticks, 0 in ticks after a collision."""
+    """Terms of the reward, or the reward, shape (B,) each, as of `run_ticks`."""
     features: NDArray[np.float32] | None = None
     """The observation `features`, shape (B, F), where it is known already."""
 

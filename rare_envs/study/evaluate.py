@@ -218,8 +218,9 @@ class RowKeeper:
 def recheck(study: Study, kept: RowKeeper) -> Repeatability | None:
     """Simulate the kept scenarios again: in another order and in small batches, and a few each alone."""
     problem = study.problem
-    rules = isinstance(problem.ego, str) and problem.ego in RULE_BASED_EGOS and ":" not in study.question.measure
-    if problem.needs.varies or rules:
+    given = problem.world.policies or ":" in study.question.measure + (study.question.drivers or "")
+    rules = isinstance(problem.ego, str) and problem.ego in RULE_BASED_EGOS
+    if problem.needs.varies or (rules and not given):  # no code but our own, which repeats
         return None
     x, f = kept.rows
     order = np.random.default_rng(1).permutation(len(f))

@@ -343,10 +343,27 @@ def test_missing_keys_and_other_dimensions_are_named() -> None:
         TruncatedGaussianMixture(FOLLOWING.weights, FOLLOWING.means, FOLLOWING.covariances, coordinates=two)
 
 
+@pytest.mark.parametrize("mean", [[20.0, 25.0], [44.0, 44.5]])
+def test_density_and_draws_with_a_difference_agree_where_its_range_vanishes(mean: list[float]) -> None:
+    """A lead that brakes by loss keeps 1 m/s or more: the density adds up to 1 also with its mass at the edge."""
+    made = {"low": [0.0, 0.0], "high": [45.0, 45.0], "names": ("loss", "speed"), "order": ("loss", "speed")}
+    braking = Coordinates(**made, within=(("speed", "loss", 1.0, 45.0),))
+    mixture = TruncatedGaussianMixture([1.0], [mean], [np.diag([9.0, 9.0])], coordinates=braking)
+    middles = (np.arange(1000) + 0.5) * 0.045
+    points = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
+    assert np.exp(mixture.log_prob(points)).sum() * 0.045**2 == pytest.approx(1.0, abs=0.02)
+    x = mixture.sample(2000, np.random.default_rng(0))
+    assert np.isfinite(mixture.log_prob(x)).all() and np.isfinite(mixture.to_standard_normal(x)).all()
+    with pytest.raises(ValueError, match=r"x\[0, 0\] = 43.9 is outside the range \[0, 43.56\]"):
+        mixture.to_standard_normal([[43.9, 44.95]])
+    with pytest.raises(ValueError, match=r"within leaves loss no range: from 9\.95 to 9\.9"):
+        Coordinates(**{**made, "low": [9.95, 0.0], "high": [20.0, 10.0]}, within=(("speed", "loss", 0.0, 10.0),))
+
+
 def test_bad_points_are_refused() -> None:
     with pytest.raises(ValueError, match=r"x of shape \(n, 3\), got \(3,\); add a batch axis"):
         FOLLOWING.log_prob([10.0, 10.0, 20.0])
-    with pytest.raises(ValueError, match=r"x\[0, 2\] = 0.5 is outside the box \[1, 150\] of coordinate 2"):
+    with pytest.raises(ValueError, match=r"x\[0, 2\] = 0.5 is outside the range \[1, 150\] of coordinate 2"):
         FOLLOWING.to_standard_normal([[10.0, 10.0, 0.5]])
     with pytest.raises(ValueError, match=r"u\[0, 1\] = nan must be finite"):
         FOLLOWING.from_standard_normal([[0.0, np.nan, 0.0]])

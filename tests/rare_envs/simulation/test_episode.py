@@ -114,7 +114,7 @@ def test_the_last_columns_of_x_are_the_egos_noise() -> None:
 
 
 def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
-    """20 m/s is a target speed, so the ego coasts; ticks after a collision count as 0."""
+    """20 m/s is a target speed, so the ego coasts; ticks after a collision count as 0, and it counts once."""
     world = World(CAR_FOLLOWING, clock=Clock(horizon=2.0, action="meta"))
     episode = world.start(torch.tensor([[20.0, 10.0, 80.0], [20.0, 10.0, 3.5]]))
     seen = []
@@ -124,8 +124,29 @@ def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
     # 3.5 m at 10 m/s: the bodies overlap after the fourth tick
     assert result.episode.collided.tolist() == [False, True]
     assert float(result.terms.progress[1]) == pytest.approx(0.4 * 20.0 / 21.72)
-    assert float(result.terms.collision[1]) == pytest.approx(-3.0)
+    assert float(result.terms.collision[1]) == pytest.approx(-30.0)
     assert torch.equal(result.episode.state.x[1], seen[3].state.x[1])  # it stays as it was then
+
+
+def test_weights_count_a_collision_once_and_functions_cannot_write_to_the_traffic() -> None:
+    x = [20.0, 10.0, 3.5]
+    how: Any = {"action": "meta", "reward": {"collision_reward": -1}}
+    single, batch = gym.make("rare_envs/CarFollowing-v0", **how), gym.make_vec("rare_envs/CarFollowing-v0", 1, **how)
+    single.reset(options={"x": x})
+    batch.reset(options={"x": [x]})
+    assert (single.step(IDLE)[1], batch.step(np.array([IDLE]))[1].tolist()) == (-1.0, [-1.0])
+
+    def stop(now: Any) -> Any:
+        now.speed[:] = now.acceleration[:] = 0.0
+        return now.speed
+
+    ends = [gym.make("rare_envs/CarFollowing-v0", reward=reward) for reward in (None, stop)]
+    for env in ends:
+        env.reset(options={"x": [20.0, 15.0, 30.0]})
+    first, second = ([env.step(np.zeros(2, dtype=np.float32))[0] for _ in range(2)] for env in ends)
+    assert np.array_equal(first, second)
+    with pytest.raises(ValueError, match="each term of the reward once, got 'speed', 'speed_reward'"):
+        gym.make("rare_envs/CarFollowing-v0", reward={"speed": 1.0, "speed_reward": 2.0})
 
 
 def test_reward_by_hand() -> None:

@@ -239,6 +239,17 @@ def test_others_are_not_suspected(ego: Any) -> None:
     assert (found.n, found.n_differing, found.warning) == (KEPT_ROWS + ROWS_ALONE, 0, "")
 
 
+def test_a_driver_without_an_f_is_noticed_behind_a_ruled_ego(here: Path) -> None:
+    (here / "moody.py").write_text(
+        "import numpy as np\n\nclass Lead:\n    calls = 0\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
+        "        self.calls += 1\n"
+        "        return np.full((len(observation), 2), [-1.0 if self.calls % 50 > 25 else 0.1, 0.0]), state\n"
+    )
+    found = run(prepare(replace(QUESTION, base=None, ego="idm", drivers="lead=moody:Lead"))).repeatability
+    assert found is not None and found.n_differing > 3
+
+
 def test_an_ego_that_depends_on_its_process_is_noticed(here: Path) -> None:
     (here / "hashed.py").write_text(
         "import os\nimport numpy as np\n\nclass Ego:\n"
