@@ -50,6 +50,8 @@ MIN_SIDE_ESS = 30.0
 """Effective failing units below which a probability is called coarse: its c.o.v. is then about 0.2 or more."""
 RATIO_COARSE = "the ratio is imprecise"
 """Words of the warnings that say how imprecise the ratio is, which its interval includes."""
+ROUNDING = 1e-12
+"""Share of the largest of three sums of weights below which another is the rounding of a difference."""
 BASE_CHECK_DRAWS = 16
 """Draws at which the densities of the two base distributions are compared."""
 
@@ -249,9 +251,23 @@ def list_ratio_facts(
     sides = [(name, _describe_side(side, exact)) for name, side in zip(labels, (found.a, found.b), strict=True)]
     rows = [("Ratio", text), ("Limited by", limit), ("Left out", left_out), *sides]
     if found._has_ratio:
-        both, first, second = format_alike(*list(found.shares.values())[:3])
+        both, first, second = format_shares([(1.0, found)])
         rows.append(("Together", say("shares", both=both, a=a, first=first, b=b, second=second)))
     return [row for row in rows if row[1]]
+
+
+def format_shares(pairs: Sequence[tuple[float, Comparison]]) -> list[str]:
+    """Return P[both fail], P[only A] and P[only B], each a sum with factors; what no draw showed by its upper limit."""
+    sums, most = np.zeros(3), np.zeros(3)
+    for factor, pair in pairs:
+        sums += factor * np.array(list(pair.shares.values())[:3])
+        missed = pair.either.bound_missed(0.5 + pair.confidence / 2)
+        a, b = (min(missed, side.interval[1]) for side in (pair.a, pair.b))
+        most += factor * np.array([min(a, b), a, b])
+    seen = sums > ROUNDING * sums.max()
+    values = format_alike(*np.where(seen, sums, 0.0).tolist())
+    limits = (format_alike(float(high))[0] for high in most)
+    return [v if is_seen else f"below {high}" for v, high, is_seen in zip(values, limits, seen, strict=True)]
 
 
 def _describe_side(side: Side, exact: str) -> str:

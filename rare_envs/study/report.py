@@ -95,6 +95,15 @@ def find_frequency(study: Study) -> EventFrequency:
     raise ValueError(f"no rate per km: {reason}")
 
 
+def fold_spread(uncertainty: samplers.analysis.BaseUncertainty | None) -> tuple[float, float]:
+    """Return t over the normal quantile, by which errors grow, and that of log p from its base; 1 and 0 if unknown."""
+    if uncertainty is None or not math.isfinite(uncertainty.spread):
+        return 1.0, 0.0
+    quantile = refit_quantile(uncertainty.confidence, len(uncertainty.value_refits) - 1, uncertainty.clusters)
+    fold = quantile / normal_quantile(uncertainty.confidence)
+    return fold, fold * math.hypot(uncertainty.spread, FIT_BIAS)
+
+
 def describe_left_out(study: Study, estimate: samplers.Estimate) -> str:
     """Return which error the intervals leave out, and why; empty if they hold all."""
     base, reason = estimate.base_uncertainty, ""
@@ -380,9 +389,7 @@ class Report:
         if not (value > 0 and math.isfinite(cov)):
             low, cov = 0.0, 0.0
         elif uncertainty is not None and math.isfinite(uncertainty.spread):
-            quantile = refit_quantile(uncertainty.confidence, len(uncertainty.value_refits) - 1, uncertainty.clusters)
-            fold = quantile / normal_quantile(self.estimate.confidence)
-            base_sd = fold * math.hypot(uncertainty.spread, FIT_BIAS)
+            fold, base_sd = fold_spread(uncertainty)
             low, high = uncertainty.interval or (0.0, high if uncertainty.bound is None else uncertainty.bound)
         base = self.study.fitted
         data = "" if base is None else read_source(base.record)["data"]  # rates of bases of the same events say so

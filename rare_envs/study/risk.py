@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
@@ -31,11 +31,11 @@ from rare_envs.study.evaluate import compare_egos, run, run_into
 from rare_envs.study.events import COUNTED, EventRate, add_people, count_people, sum_people
 from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
-from rare_envs.study.report import MODEL_NOUN, Report, find_frequency, judge_rate
+from rare_envs.study.report import MODEL_NOUN, Report, find_frequency, fold_spread, judge_rate
 from rare_envs.study.run_folder import COMPARISON, FAILURES, JOURNAL, RISK
 from rare_envs.study.writing import SUM, check_no_results, clear_runs, unwritten_results
 from samplers.analysis.gate import find_doubt, judge_ends
-from samplers.comparison import RATIO_COARSE, Side
+from samplers.comparison import RATIO_COARSE, Side, format_shares
 from samplers.evaluate import Executor
 from samplers.output import LABEL, MOST_LINES, WIDTH, Row, fold_rows, format_alike, say
 from samplers.problem import FloatArray
@@ -545,11 +545,10 @@ class RiskComparison:
         for name, pair in self.scenarios.items():
             z, per_km = exposure.normal_quantile(pair.confidence), self.frequencies[name].per_km
             known = None if exact else pair.base_uncertainty
-            either = None if exact else pair.either.base_uncertainty
-            spread = 0.0 if either is None or not math.isfinite(either.spread) else either.spread
+            fold, spread = fold_spread(None if exact else pair.either.base_uncertainty)
             common = per_km * np.exp(math.hypot(self.frequencies[name].log_sd, spread) * rng.standard_normal(n))
             a, b = (
-                common * side.p * np.exp((side.cov if side.p > 0 else 0.0) * rng.standard_normal(n))
+                common * side.p * np.exp((fold * side.cov if side.p > 0 else 0.0) * rng.standard_normal(n))
                 for side in (pair.a, pair.b)
             )
             low, high = pair.interval if known is None or known.interval is None else known.interval
@@ -577,8 +576,7 @@ class RiskComparison:
         rng, n, z = np.random.default_rng(0), exposure.RATE_DRAWS, exposure.normal_quantile(self.confidence)
         ends = np.zeros((2, n))
         for (name, pair), side in zip(self.scenarios.items(), sides, strict=True):
-            counted, either = self.frequencies[name], pair.either.base_uncertainty
-            spread = 0.0 if either is None or not math.isfinite(either.spread) else either.spread
+            counted, (_, spread) = self.frequencies[name], fold_spread(pair.either.base_uncertainty)
             events = counted.per_km * np.exp(counted.log_sd * rng.standard_normal(n))
             error, traffic = rng.standard_normal(n), np.exp(spread * rng.standard_normal(n))
             if side.p > 0:
@@ -597,9 +595,11 @@ class RiskComparison:
     def left_out(self) -> str:
         """Why the error of a traffic model is not in the interval; empty if it is."""
         for name, pair in self.scenarios.items():
-            known = pair.base_uncertainty
-            if pair.a.p > 0 and pair.b.p > 0 and known is not None and known.interval is None:
+            known, either = pair.base_uncertainty, pair.either.base_uncertainty
+            if known is not None and known.interval is None:
                 return f"{text.name_scenario(name)}: {known.reason.rstrip('.')}"
+            if either is not None and not math.isfinite(either.spread):
+                return f"{text.name_scenario(name)}: {either.reason.rstrip('.')}"
         return ""
 
     @property
@@ -615,24 +615,31 @@ class RiskComparison:
         """Whether B has fewer than `max_ratio` times as many collisions as A; None without a limit."""
         if self.max_ratio is None:
             return None
-        doubt = find_doubt([each for each in self.warnings if RATIO_COARSE not in each])
+        own = find_doubt([each for each in self._name(lambda pair: pair.warnings) if RATIO_COARSE not in each])
+        own = "no failure of A or B was found" if math.isnan(self.ratio) else own
+        of_base = find_doubt([each for each in self.warnings if RATIO_COARSE not in each])
+        bases = [pair.base_uncertainty for pair in self.scenarios.values()]
 
         def judge(exact: bool) -> samplers.analysis.Verdict:
-            ends = self.interval_if_exact if exact else self.interval
+            ends = self.interval_if_exact if exact else (0.0, math.inf) if self.left_out else self.interval
             low, high = (math.inf if end == 0 else 1.0 / end for end in reversed(ends))
-            reason = "no failure of A or B was found" if math.isnan(self.ratio) else doubt
-            reason = reason or ("" if exact else self.left_out)
-            about: dict[str, Any] = {"quantity": "collisions of B / A", "includes_base": not exact}
+            reason = own or ("" if exact else self.left_out or of_base)
+            about: dict[str, Any] = {"quantity": "collisions of B / A", "includes_base": not exact and all(bases)}
             return judge_ends(self.max_ratio or 0.0, (low, high), self.confidence, reason, **about)
 
-        found = judge(self.assume_traffic)
-        return replace(found, if_exact=None if self.assume_traffic else judge(True).decision)
+        found, is_exact = judge(self.assume_traffic), self.assume_traffic or not any(bases)
+        return replace(found, if_exact=None if is_exact else judge(True).decision)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts, by scenario."""
-        named = ((text.name_scenario(name), pair.warnings) for name, pair in self.scenarios.items())
-        return tuple(f"{name}: {warning}" for name, warnings in named for warning in warnings)
+        """Doubts about the ratios and about the errors of their traffic models, by scenario."""
+        return self._name(lambda pair: pair.all_warnings)
+
+    def _name(self, find: Callable[[samplers.comparison.Comparison], Sequence[str]]) -> tuple[str, ...]:
+        """Return texts about the scenarios, each behind the name of its own."""
+        return tuple(
+            f"{text.name_scenario(name)}: {each}" for name, pair in self.scenarios.items() for each in find(pair)
+        )
 
     def __str__(self) -> str:
         """Return the answer, for people: the ratio, what limits it, both rates, and last the verdict."""
@@ -676,7 +683,8 @@ class RiskComparison:
             rate_ends = self._find_rate_interval(own)
             rate = text.format_with_interval(rates[letter.lower()], rate_ends, " per million km")
             sides.append((name if len(name) < LABEL - 1 else letter, say("rate of all", rate=rate, people=counted)))
-        both, first, second = format_alike(rates["both"], rates["only_a"], rates["only_b"])
+        per_km = (exposure.MILLION_KM * self.frequencies[name].per_km for name in self.scenarios)
+        both, first, second = format_shares(list(zip(per_km, pairs, strict=True)))
         shares = f"{say('shares', both=both, a=a, first=first, b=b, second=second)} per million km"
         left_out = known and say("error not known", model=MODEL_NOUN, reason=known)
         rows = [("Ratio", said), ("Limited by", limit), ("Left out", left_out), *sides, ("Together", shares)]

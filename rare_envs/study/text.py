@@ -248,12 +248,22 @@ def explain_risk(risk: Result) -> list[str]:
 
 def explain_comparison(found: Result) -> list[str]:
     """Return what the ratio of a comparison means and what not, in sentences."""
+    base, of_either = found["base_uncertainty"], found["either"]["base_uncertainty"]
+    pairs = [(found["interval"], found[side]["interval"]) for side in ("a", "b")]
+    pairs += [(base["interval"], of_either["interval"])] if base and of_either else []
+    better = all(_log_width(ratio) < _log_width(p) for ratio, p in pairs)
+    known = ", so their ratio is known better than either probability" if better else ""
     return [
-        f"Both egos drove the same {found['n_sim'] // 2:,} scenarios, so their ratio is known better than either "
-        "probability.",
+        f"Both egos drove the same {found['n_sim'] // 2:,} scenarios{known}.",
         "The ratio is of this scenario and traffic model. In another one the order of the two may differ.",
         "A kind of failure that no simulation of either came near would not have been seen.",
     ]
+
+
+def _log_width(ends: Sequence[float | None] | None) -> float:
+    """Return the width of an interval of a logarithm; infinite if an end is not known."""
+    low, high = ends or (None, None)
+    return math.log(high / low) if low and high else math.inf
 
 
 def format_probability(p: float | None, like: float | None = None) -> str:

@@ -26,9 +26,15 @@ from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.simulation.observation import observation_space
 from rare_envs.study import BadInput, Question, prepare, run
 from rare_envs.study.events import EventRate, list_part_errors, sum_people
-from rare_envs.study.report import describe_left_out, find_frequency
+from rare_envs.study.report import describe_left_out, find_frequency, fold_spread
 from rare_envs.study.risk import RiskComparison, compare_sites
-from rare_envs.study.text import describe_calibration, format_rate, format_with_interval, tabulate_events
+from rare_envs.study.text import (
+    describe_calibration,
+    explain_comparison,
+    format_rate,
+    format_with_interval,
+    tabulate_events,
+)
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
 
 FEW = {"method": "mc", "max_sim": 400}
@@ -400,6 +406,55 @@ def test_without_failures_of_one_ego_the_ratio_of_sums_has_one_limit() -> None:
     assert [each.decision for each in limited if each is not None] == ["passes", "fails", "undecided"]
     assert str(replace(above, max_ratio=1.0)).splitlines()[-1].startswith("GATE passes")
     assert above.to_dict()["ratio"] is neither.to_dict()["ratio"] is None
+
+
+def under_refits(pair: samplers.comparison.Comparison, spread: float, **changes: Any) -> samplers.comparison.Comparison:
+    """Return a comparison with an error of the traffic model, and one of P[A or B fails] with a spread."""
+    about: dict[str, Any] = {"value": pair.ratio, "interval": (2.0, 9.0), "spread": 0.1, "ess_refits": (99.0,) * 40}
+    about |= {
+        "value_refits": (1.0,) * 40,
+        "clusters": 17,
+        "confidence": 0.95,
+        "fitted_to": "20 events",
+        "family": "one",
+    }
+    of_ratio = samplers.analysis.BaseUncertainty(**{**about, **changes})
+    either = replace(pair.either)
+    vars(either)["base_uncertainty"] = replace(of_ratio, spread=spread, reason="no refit reaches them.", warnings=())
+    return replace(pair, base_uncertainty=of_ratio, either=either)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"interval": None, "reason": "why."}, {"warnings": ("The refits reach far.",)}, {}]
+)
+@pytest.mark.parametrize("of_b", [[], [0, 1]], ids=["never", "less"])
+def test_the_sum_of_one_scenario_is_judged_as_that_scenario(changes: dict[str, Any], of_b: Sequence[int]) -> None:
+    """An unknown error of the traffic model and a warning of it leave both undecided, for the same reason."""
+    found = add_up(cut_in=([*range(60)], of_b))
+    pair = under_refits(found.scenarios["cut_in"], 0.5, **changes)
+    one, verdict = pair.meets(0.8), replace(found, scenarios={"cut_in": pair}, max_ratio=0.8).verdict
+    assert verdict is not None and one.decision == ("undecided" if changes else "passes")
+    for name in ("decision", "includes_base", "if_exact", "limit", "confidence"):
+        assert getattr(verdict, name) == getattr(one, name)
+    assert verdict.reason.replace("cut-in: ", "") == one.reason
+
+
+def test_the_error_of_a_traffic_model_weighs_in_sums_as_in_rates_or_is_said_to_be_missing() -> None:
+    """Of 17 clusters t is 2.12 where the normal quantile is 1.96: log p has 1.08 (0.5^2 + 0.2^2)^0.5."""
+    found = add_up(cut_in=([0, 1], [0, 1]))
+    known, unknown = (under_refits(found.scenarios["cut_in"], spread) for spread in (0.5, math.nan))
+    assert fold_spread(known.either.base_uncertainty) == pytest.approx((1.0816, 0.5825), abs=1e-3)
+    found = replace(found, scenarios={"cut_in": unknown}, max_ratio=100.0)
+    assert found.verdict is not None and found.verdict.cause == "cut-in: no refit reaches them"
+    assert "error of the traffic model (cut-in: no refit reaches them)" in " ".join(str(found).split())
+
+
+def test_a_ratio_is_called_better_known_if_it_is_and_what_no_draw_showed_has_a_limit() -> None:
+    found = add_up(cut_in=([*range(9)], [*range(9)]))
+    pair = found.scenarios["cut_in"]
+    for ends, better in (((0.9, 1.1), True), ((0.01, 100.0), False)):
+        assert ("known better" in explain_comparison(replace(pair, interval=ends).to_dict())[0]) == better
+    assert "only a below 36,000, only b below 36,000 per million km" in " ".join(str(found).split())  # of 100 draws
 
 
 @pytest.mark.slow
