@@ -51,6 +51,7 @@ def set_up(
     collisions: str = "ego",
     camera: Any = None,
     weather: bool = False,
+    trust: bool = False,
     **unknown: Any,
 ) -> tuple[World, ScenarioSpace]:
     """Return the world and the scenario space of an environment.
@@ -81,6 +82,7 @@ def set_up(
             pictures; None for 66 x 200.
         weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera`; without
             it there is a clear day. Weather does not change the traffic.
+        trust: Whether the files of policies in `drivers` may run code, see `agents.load_ego`.
         **unknown: Any other argument, which is refused.
 
     Returns:
@@ -99,7 +101,7 @@ def set_up(
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
     if isinstance(drivers, str) and "=" not in drivers and names_object(drivers):
         drivers = make_object(drivers, "drivers")
-    policies = find_policies(drivers, scenario)
+    policies = find_policies(drivers, scenario, trust)
     background = find_drivers(scenario.drivers if drivers is None or policies else drivers)
     lidar = needs.lidar or any("lidar" in policy.driver.observation for policy in policies)
     world = World(

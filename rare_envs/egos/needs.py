@@ -253,8 +253,8 @@ LOADER = "agents.loading"
 """Module whose `load_ego` does it. It stands above this package and is named as a string, as entry points are."""
 
 
-def load_named_ego(ego: Any) -> Any:
+def load_named_ego(ego: Any, trust: bool = False) -> Any:
     """Return the ego that a name or file stands for, see `agents.load_ego`, and any other ego as it is."""
     if not isinstance(ego, str | Path) or ego in RULE_BASED_EGOS:
         return ego
-    return importlib.import_module(LOADER).load_ego(ego)
+    return importlib.import_module(LOADER).load_ego(ego, trust=trust)

@@ -6,6 +6,7 @@ import math
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -239,13 +240,21 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
 
 
-def find_policies(drivers: Any, scenario: Scenario) -> tuple[TrafficPolicy, ...]:
+def split_drivers(drivers: str) -> list[tuple[str, str]]:
+    """Return vehicles and their policies, as in "cutter=a.zip,lead=b.zip"; none where a text has not this form."""
+    parts = [each.partition("=") for each in drivers.split(",")]
+    named = all(mark and name.isidentifier() for name, mark, _ in parts)
+    return [(name, policy) for name, _, policy in parts] if named else []
+
+
+def find_policies(drivers: Any, scenario: Scenario, trust: bool = False) -> tuple[TrafficPolicy, ...]:
     """Return the policies that an argument `drivers` puts in single vehicles around the ego; none of all other drivers.
 
     Args:
         drivers: A policy or its file (.zip, .onnx), for the first of these vehicles; a mapping of their names
             (`Scenario.vehicle_names`) to policies or files, also as "cutter=a.zip,lead=b.zip".
         scenario: The scenario.
+        trust: Let the files of policies run code, see `agents.load_ego`.
 
     Raises:
         ValueError: There is no such vehicle; or the policy does not fit an agent of `rare_envs.parallel_env` with
@@ -254,12 +263,11 @@ def find_policies(drivers: Any, scenario: Scenario) -> tuple[TrafficPolicy, ...]
     _, *names = scenario.vehicle_names
     given: Any = drivers
     if isinstance(drivers, str | Path):
-        parts = [str(each).partition("=") for each in str(drivers).split(",")]
-        named = all(mark and name.isidentifier() for name, mark, _ in parts)
-        given = {name: file for name, _, file in parts} if named else drivers
+        named = [] if isfile(drivers) else split_drivers(str(drivers))  # a path may have a "=" too
+        given = dict(named) if named else drivers
         if not named and not str(drivers).endswith(POLICY_SUFFIXES):
             return ()
-        if named and len(given) < len(parts):
+        if named and len(given) < len(named):
             raise ValueError(f"Expected one driver for each vehicle, got {drivers}.")
     elif not isinstance(drivers, Mapping) and not is_policy(drivers):
         return ()
@@ -267,7 +275,8 @@ def find_policies(drivers: Any, scenario: Scenario) -> tuple[TrafficPolicy, ...]
     for name in given:
         check_name("vehicle of the traffic", name, names)
     return tuple(
-        TrafficPolicy(names.index(name) + 1, *_place_policy(name, policy, scenario)) for name, policy in given.items()
+        TrafficPolicy(names.index(name) + 1, *_place_policy(name, policy, scenario, trust))
+        for name, policy in given.items()
     )
 
 
@@ -275,9 +284,9 @@ POLICY_SUFFIXES = (".zip", ".onnx")
 """Endings of the files of policies that can drive traffic."""
 
 
-def _place_policy(name: str, given: Any, scenario: Scenario) -> tuple[Driver, str]:
+def _place_policy(name: str, given: Any, scenario: Scenario, trust: bool) -> tuple[Driver, str]:
     """Return the driver that a policy is in a vehicle's place, and its name."""
-    policy = wrap_callable(load_named_ego(given))
+    policy = wrap_callable(load_named_ego(given, trust))
     words = str(given) if isinstance(given, str | Path) else type(policy).__name__
     if not is_policy(policy):
         raise ValueError(f"Expected a policy with predict, or its file, to drive the {name}, got {words}.")

@@ -343,6 +343,6 @@ def plan_retraining(folders: Sequence[Path], share: float, trust: bool = False) 
             raise ValueError(
                 f"Cannot train {last.ego!r} on: it was trained behind VecNormalize, which train-ego has not."
             )
-        _, space = set_up(last.env_id, **world)
+        _, space = set_up(last.env_id, **world, trust=trust)
         retraining = Retraining(Path(last.ego), join_x(failures, space), share)
     return RetrainingPlan(last.env_id, saved.algorithm, world, retraining, 1 + max(each.seed for each in questions))

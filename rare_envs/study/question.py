@@ -1,10 +1,10 @@
 """Study: a question with everything that it names, checked and loaded before the first simulation; and trust in it.
 
-A run's question may name code: an ego or a measure `module:name`, an environment that a module registers; or an ego in
-another program or on the Hub. Whoever asks the question means these. Whoever replays or resumes a folder that came from
-elsewhere does not, and modules are found in the working directory, where such a folder may bring its own. So each run
-that is made here is noted, and a folder whose question is not among these runs no code and connects to nobody without
-trust. Files that a question names have digests.
+A run's question may name code: an ego, drivers, a measure, a traffic model or a method `module:name`, an environment
+that a module registers; or an ego or a driver in another program or on the Hub. Whoever asks the question means these.
+Whoever replays or resumes a folder that came from elsewhere does not, and modules are found in the working directory,
+where such a folder may bring its own. So each run that is made here is noted, and a folder whose question is not among
+these runs no code and connects to nobody without trust. Files that a question names have digests.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from agents.saved_ego import HUB_PREFIX, find_hub_model, find_statistics
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.needs import EgoWarning
+from rare_envs.egos.policy import split_drivers
 from rare_envs.files import digest_file, open_ordinary, parse_json_object, read_text_file
 from rare_envs.measures.registry import MEASURES
-from rare_envs.plugins import EgoGone
+from rare_envs.plugins import EgoGone, names_object
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario
@@ -72,7 +73,7 @@ def find_module_file(name: str) -> Path | None:
 
 def _digest_code(question: Question) -> str:
     """Return what identifies a question and the places of its code."""
-    code = [[name, str(find_module_file(name))] for name in list_risks(question).values()]
+    code = [[name, str(find_module_file(name))] for names in list_risks(question).values() for name in names]
     return hashlib.sha256(json.dumps([_keep_asked(question), code], sort_keys=True).encode()).hexdigest()
 
 
@@ -208,7 +209,7 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
                 )
             base = base.ensemble()
         world = {name: getattr(question, name) for name in PROBLEM_FIELDS}
-        return DrivingProblem(question.env_id, ego=ego, base=base, **world)
+        return DrivingProblem(question.env_id, ego=ego, base=base, trust=question.trust, **world)
 
 
 @torch.inference_mode()
@@ -229,20 +230,31 @@ def _answers_vary(problem: DrivingProblem, on_error: str) -> bool:
 def digest_files(question: Question) -> dict[str, str]:
     """Return the digests of the files that a question names, by path; modules are found, not imported."""
     bases = map(str.strip, (question.also_under or "").split(","))
-    drivers = (each.rpartition("=")[2] for each in (question.drivers or "").split(","))
-    names = filter(None, (question.base, *drivers, question.measure, *bases))
+    names = filter(None, (question.base, question.drivers, question.measure, question.method, *bases))
     with as_bad_input(OSError, ValueError):
         paths = {path for name in names if not name.startswith(HUB_PREFIX) for path in find_named_files(name)}
-        return {str(path): digest_file(path) for path in sorted(paths | set(find_ego_files(question)))}
+        paths.update(find_ego_files(question), *map(_find_policy_files, _list_drivers(question)))
+        return {str(path): digest_file(path) for path in sorted(paths)}
 
 
 def find_ego_files(question: Question) -> list[Path]:
     """Return the files of the ego of a question, the `VecNormalize` statistics that it is loaded with included."""
-    spec = strip_prefixes(question.ego)
+    return _find_policy_files(question.ego, question.stats)
+
+
+def _list_drivers(question: Question) -> list[str]:
+    """Return what a question names as drivers: of single vehicles, or of all."""
+    named = split_drivers(question.drivers or "")
+    return [policy for _, policy in named] or [question.drivers or ""]
+
+
+def _find_policy_files(name: str, stats: str | None = None) -> list[Path]:
+    """Return the files of a policy with its statistics, which lie beside it if they are not named."""
+    spec = strip_prefixes(name)
     files = find_named_files(spec)
     if find_ego_kind(spec) not in ("zip", "hub"):
         return files
-    found = [Path(question.stats)] if question.stats else [find_statistics(path) for path in files]
+    found = [Path(stats)] if stats else [find_statistics(path) for path in files]
     return [*files, *(path for path in found if path is not None and path.is_file())]
 
 
@@ -300,7 +312,7 @@ def open_question(recorded: object, folder: Path, trust: bool, **given: Any) -> 
     question = replace(asked, **given)
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
         raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
-    risks = [name for field, name in list_risks(question).items() if field not in given]
+    risks = [name for field, names in list_risks(question).items() if field not in given for name in names]
     if risks and not trust and _digest_code(asked) not in _read_notes():
         files = {name: find_module_file(name) for name in risks}
         named = ", ".join(f"{name!r}{f' ({path})' if path else ''}" for name, path in files.items())
@@ -329,13 +341,27 @@ def is_same_question(recorded: object, question: Question) -> bool:
     return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
 
 
-def list_risks(question: Question) -> dict[str, str]:
-    """Return code that a question names, as `module:name`, and an ego elsewhere, by field."""
-    ego, measure, env_id = strip_prefixes(question.ego), question.measure, question.env_id
-    # whether or not there is a file of that name at the moment: it may be gone when the ego is loaded
-    found = {"ego": ego} if find_ego_kind(ego) in ELSEWHERE or names_function(ego) else {}
-    found |= {"measure": measure} if ":" in measure and not measure.startswith("stl:") else {}
-    return found | ({"env_id": env_id} if ":" in env_id else {})
+def list_risks(question: Question) -> dict[str, list[str]]:
+    """Return code that a question names, as `module:name`, and egos and drivers elsewhere, by field."""
+    drivers, measure = question.drivers or "", question.measure
+    whole = names_object(drivers) and not split_drivers(drivers)  # its module has no prefix
+    bases = [question.base or "", *map(str.strip, (question.also_under or "").split(","))]
+    # whether or not there is a file of that name at the moment: it may be gone when it is loaded
+    found = {
+        "ego": [name for name in [strip_prefixes(question.ego)] if _is_risky(name)],
+        "drivers": [drivers] if whole else [*filter(_is_risky, map(strip_prefixes, _list_drivers(question)))],
+        "measure": [measure] if ":" in measure and not measure.startswith("stl:") else [],
+        "env_id": [name for name in [question.env_id] if ":" in name],
+        "method": [name for name in [question.method] if ":" in name],
+        "base": [*filter(names_object, bases[:1])],
+        "also_under": [*filter(names_object, bases[1:])],
+    }
+    return {name: risks for name, risks in found.items() if risks}
+
+
+def _is_risky(ego: str) -> bool:
+    """Return whether an ego without prefixes is code or elsewhere."""
+    return find_ego_kind(ego) in ELSEWHERE or names_function(ego)
 
 
 def _keep_asked(question: Question) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from pettingzoo.utils import parallel_to_aec
 
 import rare_envs
 import samplers
+from agents.files import SHIPPED
 from rare_envs.control.actions import IDLE
 from rare_envs.control.idm import IDM
 from rare_envs.envs.parallel import AgentsVectorEnv
@@ -21,6 +23,7 @@ from rare_envs.multi_agent import adversary_reward, own_reward, play, start, ste
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.settings import Clock
 from rare_envs.simulation.world import World, rollout
+from rare_envs.study import BadInput, Question, prepare
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated
@@ -319,3 +322,21 @@ def test_what_cannot_drive_a_vehicle_of_the_traffic_is_refused() -> None:
             rare_envs.DrivingProblem("rare_envs/CutIn-v0", drivers=drivers)
     with pytest.raises(ValueError, match=r"^Expected drivers of all vehicles here: .* as agents, by step\(\)"):
         rare_envs.parallel_env("cut_in", drivers={"cutter": Swerving()})
+
+
+def test_a_path_of_drivers_may_look_like_the_name_of_a_vehicle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("seed=0", "driver.safetensors")
+    path.parent.mkdir()
+    path.write_bytes((SHIPPED / "gail.safetensors").read_bytes())
+    found, named = (rare_envs.DrivingProblem(CUT_IN, drivers=drivers) for drivers in (str(path), "gail"))
+    assert found.column_names == named.column_names
+
+
+def test_trust_holds_for_policies_in_traffic(tmp_path: Path) -> None:
+    path = tmp_path / "ego.zip"
+    path.touch()
+    path.chmod(0o666)
+    for trust, said in ((False, "is writable by everybody"), (True, "^(?!.*writable by everybody)")):
+        with pytest.raises(BadInput, match=said):
+            prepare(Question(env_id=CUT_IN, drivers=f"cutter={path}", trust=trust))

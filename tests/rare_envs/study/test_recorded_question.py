@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
-from dataclasses import asdict, replace
+import sys
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,15 @@ CODE = {
     "environment": {"env_id": f"evil:{FOLLOWING}"},
     "a program elsewhere": {"ego": "noisy:tcp://127.0.0.1:9?timeout=1"},
     "the Hub": {"ego": "process:hf:user/ppo"},
+    "drivers": {"drivers": "evil:make"},
+    "a driver of one vehicle": {"drivers": "lead=evil:make"},
+    "a driver in a process, behind another": {"drivers": "cutter=idm.zip,lead=process:evil:make?timeout=5"},
+    "a driver elsewhere": {"drivers": "lead=tcp://127.0.0.1:9"},
+    "a driver elsewhere whose address looks like a file": {"drivers": "tcp://127.0.0.1:9/a.zip"},
+    "a driver of the Hub": {"drivers": "lead=hf:user/ppo"},
+    "traffic model": {"base": "evil:make"},
+    "another traffic model": {"also_under": "us101, evil:make"},
+    "method": {"method": "evil:Coasting"},
 }
 
 
@@ -76,6 +87,7 @@ def received(finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     (tmp_path / "evil.py").write_text(EVIL)
+    monkeypatch.delitem(sys.modules, "evil", raising=False)  # or another test's would not run again
     return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
@@ -98,6 +110,16 @@ def test_a_received_run_is_neither_replayed_nor_resumed_without_trust(name: str,
         words = r"was not made here, and its question (runs code: 'evil:|connects to .*: '(tcp|hf):).*add --trust"
         with pytest.raises(BadInput, match=words):
             act()
+    assert not Path("was_here").exists()
+
+
+@pytest.mark.filterwarnings("ignore")  # of what has changed, and of odd values
+@pytest.mark.parametrize("name", [each.name for each in fields(Question) if "str" in str(each.type)])
+@pytest.mark.parametrize("value", ["evil:make", "lead=evil:make"])
+def test_no_text_of_a_received_question_runs_code(name: str, value: str, received: Path) -> None:
+    change_question(received, **{name: value})
+    with contextlib.suppress(BadInput):
+        find_failure(received, 0)
     assert not Path("was_here").exists()
 
 
@@ -223,7 +245,7 @@ def test_values_of_every_field_are_taken_back_and_what_is_no_code_is_not_listed(
     for ego in ("idm", "ego.zip", "noisy:gail", "human:no-headway-rule", "process:imitation?timeout=3"):
         assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == {}
     for ego in ("evil:make", f"{'a' * 300}:make"):
-        assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == {"ego": ego}
+        assert list_risks(Question(env_id=FOLLOWING, ego=ego)) == {"ego": [ego]}
 
 
 @pytest.mark.parametrize("name", ["vecnormalize.pkl", "mine.pkl"])
@@ -236,3 +258,12 @@ def test_statistics_of_an_ego_are_part_of_it(name: str, here: Path) -> None:
         states.append(digest_files(question))
     bare, one, two = states
     assert find_changed_files(one, two) == find_changed_files(bare, one) == find_changed_files(one, bare) == [name]
+
+
+def test_files_of_each_driver_and_of_the_method_are_part_of_a_question(here: Path) -> None:
+    files = ("a.zip", "a_vecnormalize.pkl", "b.onnx", "ways.py")
+    for name in files:
+        (here / name).write_bytes(b"content")
+    drivers = "cutter=noisy:a.zip?latency=1,lead=b.onnx"
+    question = Question(env_id="", drivers=drivers, method="ways:Method")
+    assert sorted(Path(name).name for name in digest_files(question)) == list(files)
