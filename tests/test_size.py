@@ -11,18 +11,18 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 56_250,
-    "code lines": 35_600,
+    "package lines": 59_350,
+    "code lines": 37_750,
     "modules": 220,
-    "functions": 3_165,
-    "classes": 470,
-    "import lines, percent of code": 11.0,
-    "test lines": 32_560,
+    "functions": 3_325,
+    "classes": 485,
+    "import lines, percent of code": 10.7,
+    "test lines": 33_800,
     "pages": 18,
-    "words of pages": 40_000,
+    "words of pages": 37_000,
     "files entered by an estimate": 43,
     "files entered by plain Monte Carlo": 20,
-    "files entered by the command": 83,
+    "files entered by the command": 87,
     "own frames from estimate to f": 8,
     "own frames from the command to f": 16,
 }

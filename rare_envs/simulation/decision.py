@@ -190,6 +190,7 @@ def _weigh(given: Mapping[str, Any]) -> EgoReward:
         if not isinstance(weight, Real) or not math.isfinite(weight):
             raise ValueError(f"Expected a finite number as the weight of {name!r} in the reward, got {weight!r}.")
     kind: Any = namedtuple("WeightedTerms", weights)  # type: ignore[misc]
+    kind.once = [name for name in weights if name == "collision"]  # as in HighwayEnv, whose weights are a decision's
     return lambda episode, action: kind(*(float(w) * TERMS[name](episode, action) for name, w in weights.items()))
 
 
@@ -231,10 +232,6 @@ Tick = Callable[[EpisodesT, Tensor, bool], tuple[EpisodesT, Sequence[tuple[Any, 
 reward, a tensor (B,) or a named tuple of such, and which had collided before and earn nothing, boolean (B,)."""
 
 
-ONCE = ("collision", "fault")
-"""Terms that count once in a decision, however many ticks it has: of what happens in a single one."""
-
-
 def run_ticks(
     clock: Clock, episodes: EpisodesT, action: Tensor, tick: Tick[EpisodesT]
 ) -> tuple[EpisodesT, tuple[Any, ...]]:
@@ -242,7 +239,7 @@ def run_ticks(
 
     Meta-actions are given in the first tick, `IDLE` in those after it; a physical action in all of them. Return the
     episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0,
-    and of terms in `ONCE` the sums.
+    and the sums of terms that are named in `once` of their tuple.
     """
     stride = clock.stride
     episodes, rewards = tick(episodes, action, True)
@@ -261,9 +258,7 @@ def run_ticks(
         )
     means = (map_leaves(lambda total: total / stride, terms) for terms in sums)
     return episodes, tuple(
-        mean._replace(**{name: getattr(terms, name) for name in ONCE if name in terms._fields})  # by their names
-        if hasattr(terms, "_fields")
-        else mean
+        mean._replace(**{name: getattr(terms, name) for name in terms.once}) if hasattr(terms, "once") else mean
         for mean, terms in zip(means, sums, strict=True)
     )
 

@@ -114,7 +114,7 @@ def test_the_last_columns_of_x_are_the_egos_noise() -> None:
 
 
 def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
-    """20 m/s is a target speed, so the ego coasts; ticks after a collision count as 0, and it counts once."""
+    """20 m/s is a target speed, so the ego coasts; ticks after a collision count as 0."""
     world = World(CAR_FOLLOWING, clock=Clock(horizon=2.0, action="meta"))
     episode = world.start(torch.tensor([[20.0, 10.0, 80.0], [20.0, 10.0, 3.5]]))
     seen = []
@@ -124,7 +124,7 @@ def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
     # 3.5 m at 10 m/s: the bodies overlap after the fourth tick
     assert result.episode.collided.tolist() == [False, True]
     assert float(result.terms.progress[1]) == pytest.approx(0.4 * 20.0 / 21.72)
-    assert float(result.terms.collision[1]) == pytest.approx(-30.0)
+    assert float(result.terms.collision[1]) == pytest.approx(-3.0)
     assert torch.equal(result.episode.state.x[1], seen[3].state.x[1])  # it stays as it was then
 
 
