@@ -273,7 +273,7 @@ class TruncatedGaussianMixture(MappedMixture):
         return (self,)
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
-        """Return the log density, (n, d) -> (n,); -inf outside the box, and where `Coordinates.ends` leave no draws.
+        """Return the log density, (n, d) -> (n,); -inf outside the box and beyond `Coordinates.ends`.
 
         Raises:
             ValueError: Wrong shape.

@@ -190,7 +190,6 @@ def _weigh(given: Mapping[str, Any]) -> EgoReward:
         if not isinstance(weight, Real) or not math.isfinite(weight):
             raise ValueError(f"Expected a finite number as the weight of {name!r} in the reward, got {weight!r}.")
     kind: Any = namedtuple("WeightedTerms", weights)  # type: ignore[misc]
-    kind.once = [name for name in weights if name == "collision"]  # as in HighwayEnv, whose weights are a decision's
     return lambda episode, action: kind(*(float(w) * TERMS[name](episode, action) for name, w in weights.items()))
 
 
@@ -238,8 +237,7 @@ def run_ticks(
     """Carry out the ticks of a decision; no further ones once all have collided.
 
     Meta-actions are given in the first tick, `IDLE` in those after it; a physical action in all of them. Return the
-    episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0,
-    and the sums of terms that are named in `once` of their tuple.
+    episodes at the next decision and the agents' rewards: the means over the ticks, those after a collision being 0.
     """
     stride = clock.stride
     episodes, rewards = tick(episodes, action, True)
@@ -256,11 +254,7 @@ def run_ticks(
             map_leaves(lambda old, new, over=over: old + new.masked_fill(over, 0.0), total, terms)
             for total, (terms, over) in zip(sums, rewards, strict=True)
         )
-    means = (map_leaves(lambda total: total / stride, terms) for terms in sums)
-    return episodes, tuple(
-        mean._replace(**{name: getattr(terms, name) for name in terms.once}) if hasattr(terms, "once") else mean
-        for mean, terms in zip(means, sums, strict=True)
-    )
+    return episodes, tuple(map_leaves(lambda total: total / stride, terms) for terms in sums)
 
 
 class StepResult(NamedTuple):

@@ -128,14 +128,7 @@ def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
     assert torch.equal(result.episode.state.x[1], seen[3].state.x[1])  # it stays as it was then
 
 
-def test_weights_count_a_collision_once_and_functions_cannot_write_to_the_traffic() -> None:
-    x = [20.0, 10.0, 3.5]
-    how: Any = {"action": "meta", "reward": {"collision_reward": -1}}
-    single, batch = gym.make("rare_envs/CarFollowing-v0", **how), gym.make_vec("rare_envs/CarFollowing-v0", 1, **how)
-    single.reset(options={"x": x})
-    batch.reset(options={"x": [x]})
-    assert (single.step(IDLE)[1], batch.step(np.array([IDLE]))[1].tolist()) == (-1.0, [-1.0])
-
+def test_functions_cannot_write_to_the_traffic_and_terms_are_named_once() -> None:
     def stop(now: Any) -> Any:
         now.speed[:] = now.acceleration[:] = 0.0
         return now.speed
