@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -103,7 +104,7 @@ _RANGES: Final = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceModel:
+class ReferenceModel(ABC):
     """What the reference drivers share.
 
     Raises:
@@ -128,13 +129,13 @@ class ReferenceModel:
     def __post_init__(self) -> None:
         check_numbers(self, "reference driver", _RANGES)
 
+    @abstractmethod
     def notices(self, scene: Scene) -> Tensor:
         """Return which vehicles are noticed, boolean, (B, V)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def wanted(self, scene: Scene) -> Tensor:
         """Return the deceleration that each vehicle asks for once noticed [m/s^2], 0 without danger, (B, V)."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import glob
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -144,6 +144,26 @@ def _choose_neighbours(beside: Sequence[tuple[FloatArray, NDArray[Any]]]) -> Nei
     return load_base(find_scenario(CUT_IN), "us101")
 
 
+def _sort_usable(
+    pooled: Mapping[str, Events], tell: Callable[..., None]
+) -> tuple[dict[str, EventSet], dict[str, ValueError]]:
+    """Return the events that can be fitted, and why the others cannot; a ValueError if all are too much alike."""
+    usable, faults = dict[str, EventSet](), dict[str, ValueError]()
+    for scenario, events in pooled.items():
+        found = filter_events(events, EVENT_RECIPES[scenario], recorded_parameters(scenario))
+        tell(scenario, f"{len(found.joint):,} events")
+        try:
+            usable[scenario] = check_events(scenario, found)
+            if left_out := len(found.joint) - len(usable[scenario].joint):
+                typer.echo(f"{scenario}: {left_out} left out: {usable[scenario].log[-2]['reason']}", err=True)
+        except ValueError as error:
+            faults[scenario] = error
+    alike = {name: error for name, error in faults.items() if isinstance(error, NoSpread)}
+    if alike and not usable:
+        raise ValueError(" ".join(f"{name}: {error}" for name, error in alike.items()) + " Nothing is written.")
+    return usable, faults
+
+
 def fit_own_bases(
     tables: Iterable[Trajectories],
     scenarios: Sequence[str] | None,
@@ -179,19 +199,7 @@ def fit_own_bases(
     for scenario in chosen:
         own = [part[scenario] for part in parts]
         pooled[scenario] = {column: np.concatenate([events[column] for events in own]) for column in own[0]}
-    usable, faults = dict[str, EventSet](), dict[str, ValueError]()
-    for scenario in chosen:
-        found = filter_events(pooled[scenario], EVENT_RECIPES[scenario], recorded_parameters(scenario))
-        tell(scenario, f"{len(found.joint):,} events")
-        try:
-            usable[scenario] = check_events(scenario, found)
-            if left_out := len(found.joint) - len(usable[scenario].joint):
-                typer.echo(f"{scenario}: {left_out} left out: {usable[scenario].log[-2]['reason']}", err=True)
-        except ValueError as error:
-            faults[scenario] = error
-    alike = {name: error for name, error in faults.items() if isinstance(error, NoSpread)}
-    if alike and not usable:
-        raise ValueError(" ".join(f"{name}: {error}" for name, error in alike.items()) + " Nothing is written.")
+    usable, faults = _sort_usable(pooled, tell)
     out.mkdir(parents=True, exist_ok=True)
     for scenario in chosen:
         write_events(pooled[scenario], out / f"{scenario}_events.csv")
