@@ -59,7 +59,8 @@ docs: $(VENV)/.docs  ## Build the documentation site in build/site (Python 3.11 
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 	@echo "Open build/site/index.html, or run: $(BIN)/python -m mkdocs serve"
 
-bench: $(VENV)/.installed  ## Measure speed against HighwayEnv.
+bench: $(VENV)/.installed  ## Measure speed against HighwayEnv, and against EnvPool where it installs.
+	-@$(INSTALL) -c constraints.txt -e ".[bench]"
 	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation.throughput
 
 clean:  ## Remove the environment, caches and runs.

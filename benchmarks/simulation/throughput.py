@@ -1,4 +1,4 @@
-"""How fast is it? Ratios within one run on one core against HighwayEnv's objects doing the same.
+"""How fast is it? Ratios within one run on one core against HighwayEnv's objects doing the same, and EnvPool's.
 
     python -m benchmarks.simulation.throughput [--out build/throughput.json]
 
@@ -24,6 +24,7 @@ import rare_envs
 import samplers
 from benchmarks import seconds
 from benchmarks.samplers.runs import about
+from benchmarks.simulation import envpool_pair
 from benchmarks.simulation import highway_env_reference as reference
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import use_one_thread
@@ -55,13 +56,17 @@ FLOORS = {
     "vec_step": 1000.0,
     "vec_step_cut_in": 1000.0,
     "vec_step_cut_in_v1": 500.0,
+    "envpool_step_decision": 0.1,
+    "envpool_step_tick": 0.3,
+    "envpool_policy_decision": 0.5,
+    "envpool_policy_tick": 4.0,
     "highway_1": 1.0,
     "highway_64": 30.0,
     "highway_256": 150.0,
     "highway_512": 200.0,
     "highway_1024": 200.0,
 }
-"""Least ratios to HighwayEnv."""
+"""Least ratios to HighwayEnv, or to EnvPool's C++ of it."""
 CORES = {"torch": "", "numba": "_compiled"}
 """Cores, and endings of the names of their results."""
 BATCHES = (1, 64, 256, 512, 1024)
@@ -327,6 +332,11 @@ def main(
         results["vec_step_cut_in_v1"] = batch_step_ratio(CUT_IN_V1, 200)
         if with_memory:
             results["memory"] = memory()
+        if envpool_pair.is_installed():
+            for name, rates in envpool_pair.measure_all(rounds).items():
+                results[name] = _compare_rates(rates["ours"], rates["theirs"])
+        else:
+            print("EnvPool is not installed: no comparison with it.")
     missed = [name for name, row in results.items() if not judge(name, row)]
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps({"machine": describe_run(), "results": results}, indent=2) + "\n")
@@ -354,7 +364,8 @@ def judge(name: str, row: dict[str, float]) -> bool:
         value, limit, words = row["slow_down"], CEILINGS[name], f"times {what}"
         kept = value <= limit
     else:
-        value, limit, words = row["ratio"], FLOORS[name], "times HighwayEnv"
+        value, limit = row["ratio"], FLOORS[name]
+        words = "times EnvPool" if name.startswith("envpool") else "times HighwayEnv"
         kept = value >= limit
     further = f", {row['per_second']:,.0f} times real time" if "batch" in row else ""
     print(f"{name:28s} {value:8.3g} {words} ({'floor' if name in FLOORS else 'ceiling'} {limit:g}){further}")

@@ -128,18 +128,14 @@ def follow_meta_actions(
     """Return the new aim (B, N), and acceleration [m/s^2] and steering angle [rad] of a tick, (B, 2).
 
     With `commanded` (B, N), of all vehicles that follow their action (B, N), (B, N, 2); the ego always does. A vehicle
-    whose action does not count has no aim of its own: when it is first commanded, its aim is where it is.
+    whose action does not count has no aim of its own: when it is first commanded, its aim is where it is. Without
+    `commanded` the ego alone has one.
     """
     if commanded is None:
-        pad = state.x.shape[1] - 1
-        alone, physical = follow_meta_actions(
-            aim,
-            torch.nn.functional.pad(action[:, None], (0, pad), value=IDLE),
-            torch.zeros_like(state.x, dtype=torch.bool),
-            state,
-            road,
-        )
-        return alone, physical[:, 0]
+        own, ego = Aim(*(each[:, 0] for each in aim)), state.vehicles[0]
+        own = update_aim(own, action, ego.y, ego.speed, road)
+        aim = Aim(*(torch.cat((new[:, None], old[:, 1:]), dim=1) for new, old in zip(own, aim, strict=True)))
+        return aim, control_towards(own, ego.x, ego.y, ego.heading, ego.speed, road)
     follows = commanded.clone()
     follows[:, 0] = True
     aim = Aim(*(torch.where(follows, old, new) for old, new in zip(aim, initial_aim(state, road), strict=True)))
@@ -149,6 +145,8 @@ def follow_meta_actions(
 
 def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
     """Return the targets after meta-actions: lanes within two widths, speeds next to the one nearest to the present."""
+    if bool((action == IDLE).all()):
+        return aim
     edges = constant(road.edges, y)
     aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
     wanted = (aim.lane + aside).clamp(0, road.lanes - 1)

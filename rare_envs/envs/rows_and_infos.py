@@ -113,10 +113,8 @@ def take_step(
     """Carry out decisions (B, ...) as `decision.advance`, compiled or by torch; `ignored` rows do not count."""
     mask = None if ignored is None else torch.from_numpy(ignored)
     read = read_actions(world.clock.action, torch.as_tensor(np.asarray(actions)), len(episode.collided), mask)
-    moved = None if compiled is None else compiled.advance(episode, read)
-    if moved is None:
-        return advance(world, episode, read.to(episode.collided.device), watch, reward)
-    return moved if reward is reward_terms else moved._replace(terms=reward(moved.episode, read))
+    tick = None if compiled is None else compiled.advance
+    return advance(world, episode, read.to(episode.collided.device), watch, reward, tick)
 
 
 @torch.inference_mode()

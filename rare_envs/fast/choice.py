@@ -151,12 +151,7 @@ class ScriptedStep:
     def __init__(self, world: World) -> None:
         """Take the numbers of a world, or raise NotCompiled."""
         script, sensing = find_script(world, statistics=True), world.sensing
-        _refuse(
-            {
-                f"the observation {sensing.observation!r} is": world.uses_lidar or "camera" in sensing.kinds,
-                f"the action {world.clock.action!r} is": world.clock.action == "meta",
-            }
-        )
+        _refuse({f"the observation {sensing.observation!r} is": world.uses_lidar or "camera" in sensing.kinds})
         self._numbers = import_compiler().numbers_of(*script, world.scenario.road, world.clock.dt)
 
     def advance(self, episode: Episode, physical: Tensor) -> StepResult | None:

@@ -274,20 +274,28 @@ def advance(
     action: Tensor,
     watch: Callable[[Episode], None] | None = None,
     reward: EgoReward = reward_terms,
+    compiled: Callable[[Episode, Tensor], StepResult | None] | None = None,
 ) -> StepResult:
-    """Carry out a decision of the ego, as of `World.decode_meta_actions`; `watch` gets the episodes after each tick."""
+    """Carry out a decision of the ego, as of `World.decode_meta_actions`; `watch` gets the episodes after each tick.
+
+    A tick is `compiled`'s, with the terms of `reward_terms`, where that is given and does not return None.
+    """
+    features: NDArray[np.float32] | None = None
 
     def tick(old: Episode, chosen: Tensor, first: bool) -> tuple[Episode, tuple[tuple[Any, Tensor]]]:
+        nonlocal features
         ready, physical = world.decode_meta_actions(old, chosen)
-        moved = world.step(ready, physical)
-        terms = reward(moved, physical)
-        moved = moved if first else hold_finished(old.collided, old, moved)
+        moved = compiled and compiled(ready, physical)
+        after = moved.episode if moved else world.step(ready, physical)
+        terms = moved.terms if moved and reward is reward_terms else reward(after, physical)
+        features = moved.features if moved and first else None
+        after = after if first else hold_finished(old.collided, old, after)
         if watch is not None:
-            watch(moved)
-        return moved, ((terms, old.collided),)
+            watch(after)
+        return after, ((terms, old.collided),)
 
     episode, (terms,) = run_ticks(world.clock, episode, action, tick)
-    return StepResult(episode, terms)
+    return StepResult(episode, terms, features)
 
 
 def hold_finished(over: Tensor, old: Episode, new: Episode) -> Episode:

@@ -128,13 +128,14 @@ def test_a_vehicle_that_begins_to_obey_aims_for_where_it_is() -> None:
     world, _ = set_up("rare_envs/CutIn-v0", action="meta")
     x = torch.tensor([[15.0, 24.0, 24.0, 40.0, 40.0, 4.0]], dtype=torch.float64)
     episode = world.start(x)
+    idle, nobody = torch.full((1, 3), IDLE), torch.zeros(1, 3, dtype=torch.bool)
     for _ in range(35):  # the script brings the cutter into the ego's lane
+        episode = episode._replace(aim=world.decode_meta_actions(episode, idle, nobody)[0].aim)
         episode = world.step(*world.decode_meta_actions(episode, torch.tensor([IDLE])))
-    none = torch.zeros(1, 3, dtype=torch.bool)
-    cutter = none.clone()
+    cutter = nobody.clone()
     cutter[0, 1] = True
     for _ in range(20):
-        episode = world.step(*world.decode_meta_actions(episode, torch.full((1, 3), IDLE), cutter), cutter)
+        episode = world.step(*world.decode_meta_actions(episode, idle, cutter), cutter)
     assert episode.aim is not None
     assert episode.aim.lane[0].tolist() == [0, 0, 0]
     assert abs(float(episode.state.y[0, 1])) < 0.2

@@ -87,6 +87,25 @@ def test_batches_are_those_of_torch(mode):
     assert ended > 3
 
 
+@pytest.mark.parametrize("env_id", ["CarFollowing-v0", "CutIn-v0", "CutIn-v1", "HardBrake-v0"])
+@pytest.mark.parametrize("dt", [0.1, 1.0])  # ten ticks of a decision, or one
+def test_meta_actions_are_those_of_torch(env_id, dt):
+    pair = [
+        gym.make_vec(f"rare_envs/{env_id}", num_envs=64, action="meta", dt=dt, core=core) for core in ("numba", "torch")
+    ]
+    rng, ended = np.random.default_rng(0), 0
+    for env in pair:
+        env.reset(seed=1)
+    for _ in range(30):
+        actions = rng.integers(0, 5, 64)
+        (*found, info), (*expected, expected_info) = (env.step(actions) for env in pair)
+        for value, other in zip(found, expected, strict=True):
+            assert np.allclose(value, other, atol=1e-4)
+        assert_same({"reward_terms": info["reward_terms"]}, {"reward_terms": expected_info["reward_terms"]}, 1e-4)
+        ended += int(found[2].sum())
+    assert ended > 3
+
+
 def test_a_cutter_at_the_end_of_its_path_is_level_whatever_the_rest_of_its_batch_does():
     """A heading whose cosine rounds to 1 would stay, but for rows beside which another cutter turns."""
     env = gym.make("rare_envs/CutIn-v0", core="numba").unwrapped
@@ -111,8 +130,6 @@ def test_states_in_double_precision_are_left_to_torch():
     ("env_id", "arguments"),
     [
         ("Highway-v0", {}),
-        ("CutIn-v0", {"action": "meta"}),
-        ("CutIn-v0", {"action": "meta", "dt": 1.0}),  # one tick long
         ("CutIn-v0", {"observation": "lidar"}),
     ],
 )
