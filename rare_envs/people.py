@@ -256,13 +256,6 @@ class EventCalibration:
 
 
 @cache
-def _read_calibrations() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
-    """Return what `rare_envs/data/human_calibration.json` holds, by event and traffic model."""
-    path = resources.files("rare_envs") / "data" / "human_calibration.json"
-    found: Mapping[str, Mapping[str, Mapping[str, Any]]] = json.loads(path.read_text("utf-8"))["events"]
-    return found
-
-
 def calibration(event: Event, base: str) -> EventCalibration | None:
     """Return the calibration of the human driver model in events of one kind; None if nobody measured it.
 
@@ -276,7 +269,8 @@ def calibration(event: Event, base: str) -> EventCalibration | None:
         >>> calibration("cut_in", "us101-test") is None
         True
     """
-    found = _read_calibrations().get(event, {}).get(base)
+    path = resources.files("rare_envs") / "data" / "human_calibration.json"
+    found = json.loads(path.read_text("utf-8"))["events"].get(event, {}).get(base)
     if found is None:
         return None
     drivers = {

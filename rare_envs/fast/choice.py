@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -38,15 +38,6 @@ SCRIPTS = (
 are for, the ego included."""
 MAX_UNITS = 128
 """Widest layer: beyond it torch's matrix products are faster than the compiled ones, which are made for few units."""
-
-
-class Script(NamedTuple):
-    """A compiled script."""
-
-    name: str
-    """In `rare_envs.fast.rows`."""
-    cutter: CutterModel = CUTTER
-    """The cutter of `HUMAN_CUT_IN`."""
 
 
 class CompilerFails(NotCompiled):
@@ -94,8 +85,8 @@ def simulate(world: World, driver: Driver, x: NDArray[np.float64]) -> NDArray[np
     return f
 
 
-def find_script(world: World, statistics: bool = False) -> Script:
-    """Return the compiled script of a world, with statistics of its episodes or not; else NotCompiled."""
+def find_script(world: World, statistics: bool = False) -> tuple[str, CutterModel]:
+    """Return the name of a world's compiled script, with statistics or not, and its cutter; else NotCompiled."""
     scenario, measurement = world.scenario, world.measurement
     cutter = getattr(scenario.others, "__self__", CUTTER)  # of a method; a class of a user's may decide otherwise
     script = getattr(scenario.others, "__func__", scenario.others) if type(cutter) is CutterModel else None
@@ -115,7 +106,7 @@ def find_script(world: World, statistics: bool = False) -> Script:
             "parameters of the weather are": world.dim != scenario.size,
         }
     )
-    return Script(names[0], cutter)
+    return names[0], cutter
 
 
 def read_ego(world: World, driver: Driver) -> IDM | DensePolicy:

@@ -44,8 +44,14 @@ def ttc_to_any(env: Any) -> float:
     """Return the time until the ego's body would touch any other's at constant speed and heading [s], in [0.01, 10]."""
     ego, road = env.vehicle, env.road
     others = [other for other in (*road.vehicles, *road.objects) if other is not ego and other.solid]
-    times = [contact_time(ego, other) for other in others if _may_meet(ego, other)]
-    return float(np.clip(min(times, default=np.inf), TTC_MIN, TTC_MAX))
+    # only of bodies that can touch within `TTC_MAX`: circles around them, speeds added
+    near = [
+        other
+        for other in others
+        if math.dist(ego.position, other.position) - (ego.diagonal + other.diagonal) / 2
+        <= TTC_MAX * math.dist(ego.velocity, other.velocity)
+    ]
+    return float(np.clip(min((contact_time(ego, other) for other in near), default=np.inf), TTC_MIN, TTC_MAX))
 
 
 def ttc_to_front(env: Any) -> float:
@@ -79,12 +85,6 @@ def contact_time(one: Any, other: Any) -> float:
     ends = np.stack([-reach - distance, reach - distance])[:, ~still] / speed[~still]
     enter, leave = float(ends.min(axis=0).max()), float(ends.max(axis=0).min())
     return max(enter, 0.0) if enter < leave and leave > 0.0 else np.inf
-
-
-def _may_meet(one: Any, other: Any) -> bool:
-    """Return whether two bodies are near enough to touch within `TTC_MAX`: circles around them, speeds added."""
-    way = math.dist(one.position, other.position) - (one.diagonal + other.diagonal) / 2
-    return bool(way <= TTC_MAX * math.dist(one.velocity, other.velocity))
 
 
 HIGHWAY_ENV_MEASURES: dict[str, Callable[[Any], float]] = {"ttc": ttc_to_any, "front_ttc": ttc_to_front}
@@ -319,18 +319,11 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
             f"No parameters are known for the scene by {own[0]}, which is not {known.__name__}'s; expected {names}."
         )
     simulated, decided = (inner.config[f"{name}_frequency"] for name in ("simulation", "policy"))
-    if (
-        not all(isinstance(each, int | float | np.number) and each > 0 for each in (simulated, decided))
-        or simulated < decided
-    ):
+    numbers = all(isinstance(each, int | float | np.number) and each > 0 for each in (simulated, decided))
+    if not numbers or simulated < decided or simulated % decided:
         raise ValueError(
-            f"Expected policy_frequency above 0 and at most simulation_frequency, got {decided!r} and {simulated!r}: "
-            "HighwayEnv would simulate no step from one decision to the next, so that nothing moves."
-        )
-    if simulated % decided:
-        raise ValueError(
-            f"Expected simulation_frequency as a multiple of policy_frequency, got {simulated} and {decided}: "
-            "HighwayEnv would simulate less time than a step lasts."
+            f"Expected simulation_frequency as a multiple of policy_frequency, both above 0, got {simulated!r} and "
+            f"{decided!r}: HighwayEnv would simulate less time than a step lasts, or none."
         )
     return LAYOUTS[known]
 

@@ -5,12 +5,10 @@ References:
     "RTAMT: online robustness monitors from STL", 2020.
 """
 
-import difflib
 import logging
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -21,6 +19,7 @@ from torch import Tensor
 from rare_envs.measures.base import Moment, Trace, TraceMeasure
 from rare_envs.measures.longitudinal import drac, thw, ttc
 from rare_envs.measures.two_dimensional import clearance
+from rare_envs.plugins import did_you_mean
 from rare_envs.startup import advise_install
 
 ROBUSTNESS_MAX = 1e6
@@ -116,30 +115,20 @@ def _parse(formula: str, dt: float) -> tuple[Any, list[str]]:
         monitor.declare_var(name, "float")
     monitor.spec = formula
     monitor.set_sampling_period(dt, "s", 0.1)
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # of what is raised as an error here
     try:
-        with _without_logging():
-            monitor.parse()
+        monitor.parse()
     except KeyError as error:
         unknown = str(error.args[0])
-        near = difflib.get_close_matches(unknown, list(SIGNALS), n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise ValueError(
-            f"The formula names an unknown signal {unknown!r}{hint}; the signals are {', '.join(SIGNALS)}, "
-            "and x_0, y_0, heading_0, speed_0 and so on of every vehicle."
+            f"The formula names an unknown signal {unknown!r}{did_you_mean(unknown, SIGNALS)}; the signals are "
+            f"{', '.join(SIGNALS)}, and x_0, y_0, heading_0, speed_0 and so on of every vehicle."
         ) from error
     except rtamt.RTAMTException as error:
         raise ValueError(f"The formula {formula!r} does not parse: {error}") from error
+    finally:
+        logging.disable(level)
     if len(monitor.ast.specs) != 1:
         raise ValueError(f"Expected one formula, got {len(monitor.ast.specs)} in {formula!r}; join them with 'and'.")
     return monitor, names
-
-
-@contextmanager
-def _without_logging() -> Iterator[None]:
-    """Keep rtamt from logging what is raised as an error here."""
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(level)

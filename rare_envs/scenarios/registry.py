@@ -77,12 +77,6 @@ def env_id_of(name: str) -> str:
     raise ValueError(f"Unknown environment {name!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
 
 
-def split_version(env_id: str) -> tuple[str, int | None]:
-    """Return an id without its version, and the version; None if it has none."""
-    found = re.fullmatch(r"(.*)[-_][vV](\d+)", env_id)
-    return (found[1], int(found[2])) if found else (env_id, None)
-
-
 HIGHWAY_ENV_IDS = (
     *("highway-v0", "highway-fast-v0", "merge-v0", "merge-v1", "roundabout-v0", "roundabout-v1"),
     *("intersection-v0", "intersection-v1", "intersection-v2"),
@@ -118,8 +112,9 @@ def complete_id(name: Any) -> Any:
 
 
 def _spell(env_id: str) -> tuple[str, str, int | None]:
-    """Return the bare letters of an id's namespace and name, and its version."""
-    family, version = split_version(env_id)
+    """Return the bare letters of an id's namespace and name, and its version; None if it has none."""
+    found = re.fullmatch(r"(.*)[-_][vV](\d+)", env_id)
+    family, version = (found[1], int(found[2])) if found else (env_id, None)
     namespace, _, name = (re.sub(r"[^\w/]|_", "", family).lower()).rpartition("/")
     return namespace, name, version
 

@@ -361,23 +361,16 @@ def apply_overrides(
     released = overridden & ~commanded
     if bool(released[:, 1:].any()):
         if driven is None:
-            action = torch.where(released[..., None], rule_based_actions(episode), action)
-            commanded = overridden
+            seen = (state.seen_by(vehicle) for vehicle in range(state.x.shape[1]))
+            views = (episode._replace(state=each, lead=lead_of(each, road)) for each in seen)
+            by_rule = torch.stack([_RULE.act(view, None)[0] for view in views], dim=1)
+            action, commanded = torch.where(released[..., None], by_rule, action), overridden
         else:
             others = _choose(released[:, 1:], drive_points(state, driven, dt, road), others)
     x, y, heading, speed = (field[:, 1:] for field in state[:4])
     curvature = None if road.reference_line is None else road.curvature(x)
     moved = Others(*bicycle(x, y, heading, speed, action[:, 1:, 0], action[:, 1:, 1], dt, curvature))
     return _choose(commanded[:, 1:], moved, others), overridden
-
-
-def rule_based_actions(episode: Episode) -> Tensor:
-    """Return accelerations [m/s^2] and steering angles [rad] by IDM in each vehicle's place, (B, N, 2)."""
-    actions = []
-    for vehicle in range(episode.state.x.shape[1]):
-        state = episode.state.seen_by(vehicle)
-        actions.append(_RULE.act(episode._replace(state=state, lead=lead_of(state, episode.road)), None)[0])
-    return torch.stack(actions, dim=1)
 
 
 def _choose(which: Tensor, one: Others, other: Others) -> Others:

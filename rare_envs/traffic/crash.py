@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.devices import indices
+from rare_envs.devices import indices, may_hold
 from rare_envs.traffic.bodies import Which, boxes_overlap, crossing, encounter, pairs
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -96,7 +96,7 @@ def crash_of(state: State, road: Road, before: State | None = None, dt: float = 
     """
     crash = _pair_crash(state, road, before, dt, "ego")
     off = (crash.kind == NONE) & road.off_road(state.y[:, 0])
-    return crash.replace_where(off, _edge_crash(state, before, dt))
+    return crash.replace_where(off, _edge_crash(state, before, dt)) if may_hold(off) else crash
 
 
 def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
@@ -107,11 +107,11 @@ def crash_of_others(state: State, road: Road, before: State | None = None, dt: f
 
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: Which) -> Crash:
     """Return the first contact among some pairs of vehicles."""
-    n, nothing = state.x.shape[1], Crash.nothing(state.x[:, 0])
+    n = state.x.shape[1]
     of_pairs = slice(0, n - 1) if which == "ego" else slice(n - 1, None)
     numbers = [indices(index[of_pairs], state.x) for index in pairs(n)]
     if not len(numbers[0]):
-        return nothing
+        return Crash.nothing(state.x[:, 0])
     met = encounter(state, road, which, before, dt)
     axes, rate = met.axes, met.rate
     enter, _ = crossing(axes, rate)
@@ -135,12 +135,11 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
     own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
     vehicles = torch.where((own >= its)[:, None], couple, couple.flip(-1))
     change = ((1.0 + RESTITUTION) / 2.0 * closing)[:, None].expand(-1, 2)
-    lengthwise = (kind != SIDE)[:, None]
-    risk = torch.stack((injury_risk(change[:, 0], "frontal"), injury_risk(change[:, 1], "rear")), -1)
-    risk = torch.where(lengthwise, risk, injury_risk(change))
+    modes = [injury_risk(change[:, 0], mode) for mode in ("frontal", "rear", "all")]
+    risk = torch.where((kind != SIDE)[:, None], torch.stack(modes[:2], -1), modes[2][:, None])
     speed = of((met.dvx.square() + met.dvy.square()).sqrt())
-    crash = Crash(kind, vehicles, speed, closing, change, risk)
-    return nothing.replace_where(touching.any(1), crash)
+    crash, apart = Crash(kind, vehicles, speed, closing, change, risk), ~touching.any(1)
+    return crash.replace_where(apart, Crash.nothing(speed)) if may_hold(apart) else crash
 
 
 def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
