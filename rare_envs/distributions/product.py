@@ -68,6 +68,14 @@ def box_of(distribution: Any) -> tuple[FloatArray, FloatArray]:
     return -free, free
 
 
+def change_parts(parts: Sequence[Any], values: FloatArray) -> list[Any]:
+    """Return distributions with other values of their parameters, given one part after the other."""
+    counts = [len(part.parameters()) if hasattr(part, "parameters") else 0 for part in parts]
+    check_values(values, sum(counts))
+    own = np.split(values, np.cumsum(counts)[:-1])
+    return [part.with_parameters(each) if n else part for part, each, n in zip(parts, own, counts, strict=True)]
+
+
 @dataclass(frozen=True, eq=False)
 class ProductDistribution:
     """Independent blocks side by side.
@@ -151,12 +159,7 @@ class ProductDistribution:
         Raises:
             ValueError: There is not one value for each parameter, or a block refuses its values.
         """
-        counts = [len(block.parameters()) if hasattr(block, "parameters") else 0 for block in self.blocks]
-        given = np.asarray(values, dtype=np.float64)
-        check_values(given, sum(counts))
-        parts = np.split(given, np.cumsum(counts)[:-1])
-        blocks = zip(self.blocks, parts, counts, strict=True)
-        return ProductDistribution(tuple(block.with_parameters(own) if n else block for block, own, n in blocks))
+        return ProductDistribution(tuple(change_parts(self.blocks, np.asarray(values, dtype=np.float64))))
 
     def _with_parts(self, points: FloatArray) -> list[tuple[Any, FloatArray]]:
         """Return each block with its columns."""

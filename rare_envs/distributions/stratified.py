@@ -13,8 +13,8 @@ from scipy.special import log_ndtr, ndtri_exp
 from rare_envs.distributions.acceptance import AcceptedGaps
 from rare_envs.distributions.coordinates import FloatArray, freeze_arrays, move_inside
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
-from rare_envs.distributions.product import ProductDistribution, box_of
-from rare_envs.distributions.space import RELATIVE_CHANGE, Distribution, DistributionParameter, check_values
+from rare_envs.distributions.product import ProductDistribution, box_of, change_parts
+from rare_envs.distributions.space import RELATIVE_CHANGE, Distribution, DistributionParameter
 from rare_envs.distributions.truncated_normal import cut_quantile, log_interval
 
 SHARE_ROUNDING = 1e-9
@@ -223,19 +223,13 @@ class StratifiedDistribution:
         Raises:
             ValueError: There is not one value for each parameter, or a stratum refuses its values.
         """
-        given = np.asarray(values, dtype=np.float64)
-        small, bases = self._small(), [cast(Any, each.base) for each in self.strata]
-        counts = [len(base.parameters()) if hasattr(base, "parameters") else 0 for base in bases]
-        check_values(given, len(small) + sum(counts))
-        shares = np.zeros(len(bases))
+        given, small, shares = np.asarray(values, dtype=np.float64), self._small(), np.zeros(len(self.strata))
+        bases = change_parts([each.base for each in self.strata], given[len(small) :])
         shares[small] = given[: len(small)]
         shares[shares == 0.0] = 1.0 - shares.sum()
-        parts = np.split(given[len(small) :], np.cumsum(counts)[:-1])
-        changed = [
-            Stratum(each.name, float(share), base.with_parameters(own) if n else base)
-            for each, share, base, own, n in zip(self.strata, shares, bases, parts, counts, strict=True)
-        ]
-        return StratifiedDistribution(tuple(changed), self.limits, self.column, self.less)
+        names = [each.name for each in self.strata]
+        strata = tuple(map(Stratum, names, shares.tolist(), bases))
+        return StratifiedDistribution(strata, self.limits, self.column, self.less)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of a base file: how strata are told apart, and each with the entries of its own.
