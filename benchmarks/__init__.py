@@ -1,7 +1,7 @@
 """Benchmarks: scripts that measure, one question each; run them as `python -m benchmarks.FOLDER.NAME`."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 RESULTS = Path(__file__).parent / "results"
@@ -16,3 +16,16 @@ def seconds(work: Callable[[], object], repeat: int = 1, clock: Callable[[], flo
         work()
         best = min(best, clock() - start)
     return best
+
+
+def format_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table as Markdown.
+
+    Example:
+        >>> print(format_table(["a", "b"], [["1", "2"]]))
+        | a | b |
+        |---|---|
+        | 1 | 2 |
+    """
+    lines = (f"| {' | '.join(row)} |" for row in (heads, *rows))
+    return "\n".join([next(lines), "|---" * len(heads) + "|", *lines])

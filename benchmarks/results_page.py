@@ -6,11 +6,11 @@ Every table names the command that made its record; the records in `benchmarks/r
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, format_table
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 HEAD = """\
@@ -59,20 +59,6 @@ def read(name: str) -> dict[str, Any]:
     """Return a committed record."""
     record: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     return record
-
-
-def format_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table as Markdown.
-
-    Example:
-        >>> print(format_table(["a", "b"], [["1", "2"]]))
-        | a | b |
-        |---|---|
-        | 1 | 2 |
-    """
-    return "\n".join(f"| {' | '.join(row)} |" for row in [heads, *rows]).replace(
-        f"| {' | '.join(heads)} |", f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|", 1
-    )
 
 
 def name_of(env_id: str) -> str:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
+
+from rich.console import Console
+from rich.progress import track
 
 from rare_envs.files import replace_text
 from rare_envs.study.arguments import BadInput
@@ -81,24 +84,19 @@ class RunLines(Generic[_Job, _Run]):
     ) -> list[_Run]:
         """Make the runs that the file does not have, write each when it is there, and return all that are wanted.
 
-        Args:
-            jobs: Runs that are wanted, in their order.
-            make: Makes the runs of some jobs, in their order.
-            progress: Whether to show a bar on standard error.
-            description: Word before the bar.
-
-        Raises:
-            BadInput: As `read` raises.
+        `make` makes the runs of some jobs, in their order; a bar on standard error has the description before it.
+        Raises BadInput as `read` does.
         """
         drop_torn_line(self.file)
         begun = self.file.is_file() and self.file.stat().st_size > 0
         done = {self.key_of_run(run): run for run in self.read()}
         missing = [job for job in jobs if self.key_of_job(job) not in done]
         made = iter(make(missing)) if missing else iter(())
+        console = Console(stderr=True)
         with self.file.open("a", encoding="utf-8") as lines:
             if not begun:
                 lines.write(json.dumps(dict(self.header)) + "\n")
-            for run in _show_progress(made, len(missing), description) if progress else made:
+            for run in track(made, description, len(missing), console=console, disable=not progress):
                 done[self.key_of_run(run)] = run
                 content = {name: _encode(value) for name, value in self.encode(run).items()}
                 lines.write(json.dumps(content, allow_nan=False) + "\n")
@@ -120,10 +118,3 @@ def _encode(value: Any) -> Any:
 
 def _decode(value: Any) -> Any:
     return _NOT_IN_JSON.get(value, value) if isinstance(value, str) else value
-
-
-def _show_progress(runs: Iterator[_Run], total: int, description: str) -> Iterator[_Run]:
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(runs, total=total, console=Console(stderr=True), description=description)

@@ -12,10 +12,9 @@ simulation is asked by plain draws:
 """
 
 import json
-from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -40,53 +39,22 @@ MOST = {"vision": 1500}
 """Simulations of one run at most; the others get what the methods take by themselves."""
 
 
-@dataclass(frozen=True)
-class EgoResult:
-    """One ego in one scenario, by one method."""
-
-    env_id: str
-    ego: str
-    method: str
-    p: float
-    low: float
-    high: float
-    n_sim: int
-    seconds: float
-    """Wall time."""
-    warnings: tuple[str, ...]
-    words: str
-    """The likeliest failure."""
-    steps: int = 0
-    """Environment steps of the ego's training; 0 for an ego that is not trained here."""
-    parts: dict[str, tuple[float, float, float, bool]] = field(default_factory=dict)
-    """By stratum of the base distribution: p in it, the ends of its interval, and whether it is resolved; empty where
-    there are no strata."""
-
-
-def version_of(env_id: str) -> str:
-    """Return the name and version of an environment for the name of a file, such as "CutIn-v1"."""
-    return env_id.rpartition("/")[2]
+EgoResult = dict[str, Any]
+"""One ego in one scenario, by one method: `env_id`, `ego` and `method`; `p`, `low`, `high` and `n_sim`; wall time in
+`seconds`; `warnings`; `words`, the likeliest failure; `steps` of the ego's training, 0 for one not trained here;
+`parts`, by stratum of the base distribution p in it, the ends of its interval, and whether it is resolved."""
 
 
 def train_cached(algo: str, env_id: str, steps: int, folder: Path) -> Path:
     """Return the ego of `rare-envs train-ego ENV --algo ALGO --steps STEPS`; one that was trained before is kept."""
-    path = folder / f"{algo}_{version_of(env_id)}_{steps}.zip"
+    path = folder / f"{algo}_{env_id.rpartition('/')[2]}_{steps}.zip"
     return path if path.exists() else train_ego(env_id, algo, steps, seed=0, out=path, base=BASES.get(env_id))
 
 
 def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, at_most: int | None = None) -> EgoResult:
-    """Estimate, and name the likeliest failure found.
+    """Estimate, and name the likeliest failure found; by `at_most` simulations, None for those of `MOST`.
 
-    Args:
-        env_id: The scenario.
-        ego: One of `EGOS`.
-        method: Name of the method.
-        steps: Of the training, for an ego that is trained here.
-        runs: Folder of the trained egos.
-        at_most: Simulations at most; None for those of `MOST`.
-
-    Returns:
-        What came out.
+    An ego that is trained here is one of so many steps, in the folder `runs`.
     """
     trained = ego in TRAINED
     spec = str(train_cached(ego, env_id, steps, runs)) if trained else ego
@@ -95,19 +63,13 @@ def evaluate_ego(env_id: str, ego: str, method: str, steps: int, runs: Path, at_
     question = Question(env_id=env_id, ego=spec, method=method, max_sim=most, base=base, ensemble_run=False)
     report = run(prepare(question), progress=True)
     estimate = report.estimate
-    return EgoResult(
-        env_id,
-        ego,
-        method,
-        estimate.p,
-        *estimate.interval,
-        n_sim=estimate.n_sim,
-        seconds=report.seconds,
-        warnings=estimate.warnings,
-        words=describe_likeliest(report),
-        steps=steps if trained else 0,
-        parts={part.name: (part.p, *part.interval, part.resolved) for part in estimate.parts},
-    )
+    low, high = estimate.interval
+    return {
+        **{"env_id": env_id, "ego": ego, "method": method, "p": estimate.p, "low": low, "high": high},
+        **{"n_sim": estimate.n_sim, "seconds": report.seconds, "warnings": list(estimate.warnings)},
+        **{"words": describe_likeliest(report), "steps": steps if trained else 0},
+        "parts": {part.name: [part.p, *part.interval, part.resolved] for part in estimate.parts},
+    }
 
 
 def describe_likeliest(report: Report) -> str:
@@ -122,16 +84,7 @@ def describe_likeliest(report: Report) -> str:
 def read_results() -> dict[tuple[str, str], EgoResult]:
     """Return what has been measured so far, by scenario and ego, scenarios in their order."""
     cells = json.loads(EGOS_RESULT.read_text())["cells"] if EGOS_RESULT.exists() else []
-    found = {
-        (cell["env_id"], cell["ego"]): EgoResult(
-            **{
-                **cell,
-                "warnings": tuple(cell["warnings"]),
-                "parts": {name: tuple(part) for name, part in cell["parts"].items()},
-            }
-        )
-        for cell in cells
-    }
+    found = {(cell["env_id"], cell["ego"]): cell for cell in cells}
     return {key: found[key] for key in product(SCENARIOS, EGOS) if key in found}
 
 
@@ -139,7 +92,7 @@ def write_results(cells: dict[tuple[str, str], EgoResult]) -> None:
     """Write what has been measured."""
     versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__}
     about = {"command": "python -m benchmarks.driving.egos", "versions": versions}
-    EGOS_RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
+    EGOS_RESULT.write_text(json.dumps({**about, "cells": list(cells.values())}, indent=1) + "\n")
 
 
 @use_one_thread()
@@ -153,7 +106,7 @@ def main(
 ) -> None:
     """Measure what is not measured yet."""
     chosen = only.split(",") if only else []
-    measured = {key for key, cell in read_results().items() if cell.ego not in chosen or env not in cell.env_id}
+    measured = {key for key, cell in read_results().items() if cell["ego"] not in chosen or env not in key[0]}
     for key in product(SCENARIOS, EGOS):
         if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
             continue

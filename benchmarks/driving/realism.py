@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,10 +25,10 @@ import torch
 import typer
 from torch import Tensor
 
-from agents import LearnedDriver, load_driver, read_driver
+from agents import LearnedDriver, load_driver
 from agents.learned.driver import RuleDriver
 from agents.learned.networks import ACTION_SIZE
-from benchmarks import RESULTS
+from benchmarks import RESULTS, format_table
 from benchmarks.samplers.runs import about
 from rare_envs.startup import use_one_thread
 from training.imitation.evaluate import (
@@ -61,11 +61,6 @@ def rule_driver(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor
     return RuleDriver().act(features, None, None, memory)
 
 
-def add_statistics(runs: Sequence[Tallies]) -> Tallies:
-    """Return the sum of several tallies of the same scenes."""
-    return {name: np.sum([run[name] for run in runs], axis=0) for name in runs[0]}
-
-
 def bootstrap_errors(driven: Tallies, recorded: Tallies, rng: np.random.Generator, draws: int = 200) -> Realism:
     """Return standard errors by bootstrap over scenes; scenes that share vehicles are taken as independent."""
     scenes = len(driven["steps"])
@@ -82,53 +77,22 @@ def bootstrap_errors(driven: Tallies, recorded: Tallies, rng: np.random.Generato
     return Realism(**{name: spread([one[name] for one in drawn]) for name in drawn[0]})
 
 
-@dataclass(frozen=True)
-class Judge:
-    """Comparison of drivers with people."""
-
-    test: Recording
-    recorded: Tallies
-    """Statistics of the people in the test scenes."""
-
-    def row(self, name: str, kind: str, acts: Sequence[Act]) -> Row:
-        """Return the realism of a driver; of `acts` there is one for each sequence of noise, or for each policy."""
-        runs = [collect_statistics(self.test, act, SECONDS) for act in acts]
-        return {"name": name, "kind": kind, **self.figures({time: [run[time] for run in runs] for time in SECONDS})}
-
-    def figures(self, runs: dict[float, list[Tallies]]) -> Row:
-        """Return values and standard errors of several runs together, and the collision rate of each."""
-        out: Row = {}
-        for seconds, parts in runs.items():
-            whole = add_statistics(parts)
-            out[f"{seconds:g} s"] = {
-                **asdict(summarise_realism(whole, self.recorded)),
-                "standard_error": asdict(bootstrap_errors(whole, self.recorded, np.random.default_rng(0))),
-                "collisions": [summarise_realism(part, self.recorded).collision for part in parts],
-            }
-        return out
+def summarise(recorded: Tallies, name: str, kind: str, runs: dict[float, list[Tallies]]) -> Row:
+    """Return values and standard errors of several runs together, and the collision rate of each, beside a record."""
+    out: Row = {"name": name, "kind": kind}
+    for seconds, parts in runs.items():
+        whole = {name: np.sum([part[name] for part in parts], axis=0) for name in parts[0]}
+        out[f"{seconds:g} s"] = {
+            **asdict(summarise_realism(whole, recorded)),
+            "standard_error": asdict(bootstrap_errors(whole, recorded, np.random.default_rng(0))),
+            "collisions": [summarise_realism(part, recorded).collision for part in parts],
+        }
+    return out
 
 
 def noisy_drivers(driver: LearnedDriver, number: int, weights: Tensor | None = None) -> list[Act]:
     """Return a driver with several sequences of noise."""
     return [sampling_driver(driver, torch.Generator().manual_seed(seed), weights) for seed in range(number)]
-
-
-def measure_people(train: Recording, judge: Judge) -> Row:
-    """Return the record's own rates, and divergences between its training and its test scenes."""
-    learned = summarise_realism(record_statistics(train), judge.recorded)
-    row = {"name": "people", "kind": "reference", **judge.figures({time: [judge.recorded] for time in SECONDS})}
-    for seconds in SECONDS:
-        row[f"{seconds:g} s"]["divergence"] = learned.divergence
-        row[f"{seconds:g} s"]["hard_brake_in_training_scenes"] = learned.hard_brake
-    return row
-
-
-def measure_drawn(name: str, driver: LearnedDriver, judge: Judge, draws: int) -> Row:
-    """Return the realism of policies drawn from the distribution of a driver's weights, one sequence of noise each."""
-    assert driver.weights is not None
-    weights = torch.from_numpy(driver.weights.sample(draws, np.random.default_rng(0))).float()
-    acts = [noisy_drivers(driver, 1, row)[0] for row in weights]
-    return judge.row(f"{name}, drawn from its distribution", "distribution", acts)
 
 
 def measure_all(
@@ -141,46 +105,50 @@ def measure_all(
 ) -> list[Row]:
     """Return all rows, ready for JSON.
 
-    Args:
-        train: Scenes that the drivers learned from.
-        test: Scenes that they did not.
-        drivers: Drivers by name.
-        noises: Sequences of noise of each driver.
-        draws: Policies drawn from each distribution of weights.
-        say: Function that is called with the name of each measurement.
+    Drivers have learned from the scenes `train` and not from `test`. Each is driven with a number of sequences of
+    noise, and so many policies drawn from the distribution of its weights with one; `say` is told each name.
     """
-    judge = Judge(test, record_statistics(test))
-    rows = [measure_people(train, judge)]
-    for name, act in {"constant velocity": constant_velocity, "IDM, lane keeping": rule_driver}.items():
+    recorded = record_statistics(test)
+
+    def row(name: str, kind: str, acts: Sequence[Act]) -> Row:
         say(name)
-        rows.append(judge.row(name, "reference", [act]))
+        runs = [collect_statistics(test, act, SECONDS) for act in acts]
+        return summarise(recorded, name, kind, {time: [run[time] for run in runs] for time in SECONDS})
+
+    people = summarise(recorded, "people", "reference", {time: [recorded] for time in SECONDS})
+    learned = summarise_realism(record_statistics(train), recorded)
+    for seconds in SECONDS:  # divergences between training and test scenes
+        people[f"{seconds:g} s"]["divergence"] = learned.divergence
+        people[f"{seconds:g} s"]["hard_brake_in_training_scenes"] = learned.hard_brake
+    rules = {"constant velocity": constant_velocity, "IDM, lane keeping": rule_driver}
+    rows = [people, *(row(name, "reference", [act]) for name, act in rules.items())]
     for name, driver in drivers.items():
-        say(name)
-        rows.append(judge.row(name, "driver", noisy_drivers(driver, noises)))
+        rows.append(row(name, "driver", noisy_drivers(driver, noises)))
         if driver.weights is not None:
-            rows.append(measure_drawn(name, driver, judge, draws))
+            weights = torch.from_numpy(driver.weights.sample(draws, np.random.default_rng(0))).float()
+            acts = [noisy_drivers(driver, 1, each)[0] for each in weights]
+            rows.append(row(f"{name}, drawn from its distribution", "distribution", acts))
     return rows
 
 
-def format_table(rows: Sequence[Row], seconds: str) -> str:
+def format_realism(rows: Sequence[Row], seconds: str) -> str:
     """Return the rows over one time, such as "10 s", as a table in Markdown; standard errors in brackets."""
-    head = ["driver", *RATES, "speed", *(f"JS {name}" for name in BINS), f"RMSE 5 s: {', '.join(ERRORS)}"]
-    lines = [head, ["---"] * len(head)]
+    heads = ["driver", *RATES, "speed", *(f"JS {name}" for name in BINS), f"RMSE 5 s: {', '.join(ERRORS)}"]
+    lines = []
     for row in rows:
         one = row[seconds]
         rates = [f"{one[name]:.4f} ({one['standard_error'][name]:.4f})" for name in RATES]
         apart = [f"{one['divergence'][name]:.3f}" for name in BINS]
         errors = "/".join(f"{one['rmse'][name]:.2f}" for name in ERRORS) if one["rmse"] else ""
         lines.append([row["name"], *rates, f"{one['mean_speed']:.1f}", *apart, errors])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return format_table(heads, lines)
 
 
 def load_named(words: Sequence[str]) -> dict[str, LearnedDriver]:
     """Return drivers by shipped names, stems of files, or folders of trainings."""
     out = {}
     for word in words:
-        path = Path(word)
-        driver = read_driver(path) if path.suffix else load_driver(word)
+        driver, path = load_driver(word), Path(word)
         if not isinstance(driver, LearnedDriver):
             raise typer.BadParameter(f"{word!r} has not been learned; IDM is measured anyway.")
         out[path.parent.name if path.stem == "driver" else path.stem] = driver
@@ -216,7 +184,7 @@ def main(
     found = round_numbers({"realism": rows, "bins": {name: list(bins) for name, bins in BINS.items()}, "about": facts})
     result.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     for seconds in SECONDS:
-        print(f"\n{seconds:g} s:\n\n{format_table(rows, f'{seconds:g} s')}")
+        print(f"\n{seconds:g} s:\n\n{format_realism(rows, f'{seconds:g} s')}")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ import typer
 from torch import Tensor
 
 from agents import LearnedDriver, load_driver
-from benchmarks import RESULTS
+from benchmarks import RESULTS, format_table
 from benchmarks.driving.realism import constant_velocity, round_numbers, rule_driver
 from benchmarks.driving.sim_agents import MOTORWAY, SCENE_ROLLOUTS, WOSAC_2024, motion_features, score_features
 from benchmarks.samplers.runs import about
@@ -149,11 +149,6 @@ def judge(start: Start, rollouts: Tensor, copies: int = 1) -> dict[str, Any]:
     }
 
 
-def _judge_rollouts(start: Start, poses: Tensor, rollouts: int) -> dict[str, Any]:
-    """Return `judge` of rollouts, of which one stands for all where they are alike."""
-    return judge(start, poses, rollouts // len(poses))
-
-
 def average_scenes(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return means over starts, then over scenes, with standard errors over scenes; scores by scene too."""
     scenes = sorted({row["scene"] for row in rows})
@@ -208,22 +203,23 @@ def measure_scores(
     out = {}
     for name, roll in rows.items():
         with torch.inference_mode():
-            judged = [_judge_rollouts(start, roll(k, start), rollouts) for k, start in enumerate(starts)]
+            poses = ((start, roll(k, start)) for k, start in enumerate(starts))  # one stands for all that are alike
+            judged = [judge(start, each, rollouts // len(each)) for start, each in poses]
         out[name] = average_scenes(judged)
         say(name)
     out["the record itself"]["starts"] = len(starts)
     return out
 
 
-def format_table(found: dict[str, dict[str, Any]]) -> str:
+def format_scores(found: dict[str, dict[str, Any]]) -> str:
     """Return the scores as a table in Markdown; errors are standard errors over scenes, of differences over pairs."""
     names = ("score", f"less {BASELINE}'s", "kinematic", "interactive", "map", "motorway bins", "min ADE, m")
     names += ("collide", "off road", "lane changes per 10 s")
-    lines = [f"| | {' | '.join(names)} |", "|" + "---|" * (len(names) + 1)]
 
     def shown(value: dict[str, Any], digits: int = 3) -> str:
         return f"{value['mean']:.{digits}f} ± {value['standard_error']:.{digits}f}"
 
+    lines = []
     for name, row in found.items():
         published = row["wosac_2024"]
         apart = np.subtract(published["meta"]["scenes"], found[BASELINE]["wosac_2024"]["meta"]["scenes"])
@@ -232,8 +228,8 @@ def format_table(found: dict[str, dict[str, Any]]) -> str:
         cells += [*(shown(bucket) for bucket in published["buckets"].values())]
         cells += [shown(row["motorway"]["meta"]), shown(published["min_ade"], 2)]
         cells += [f"{row['collision']['mean']:.3f}", f"{row['offroad']['mean']:.3f}"]
-        lines.append(f"| {name} | {' | '.join(cells)} | {row['lane_changes_per_10_s']:.3f} |")
-    return "\n".join(lines)
+        lines.append([name, *cells, f"{row['lane_changes_per_10_s']:.3f}"])
+    return format_table(["", *names], lines)
 
 
 @use_one_thread()
@@ -263,7 +259,7 @@ def main(
     about_run = about(torch=torch.__version__, command=command, **settings, seconds=round(time.process_time() - begun))
     text = json.dumps(round_numbers({"rows": found, "settings": bins, "about": about_run}), indent=1)
     result.write_text(text + "\n", encoding="utf-8")
-    print(format_table(found))
+    print(format_scores(found))
 
 
 if __name__ == "__main__":

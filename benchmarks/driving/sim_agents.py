@@ -50,18 +50,11 @@ def motion_features(
 ) -> dict[str, Tensor]:
     """Return the features of every agent at every step.
 
-    Args:
-        states: Poses, shape (..., n_agents, T, 3): x along the road [m], y across it and positive to the right [m],
-            heading [rad]; leading axes may be rollouts.
-        valid: Where an agent is recorded, boolean, shape (n_agents, T). Elsewhere nobody sees it.
-        sizes: Lengths and widths [m], shape (n_agents, 2).
-        edges: y of the left and the right edge of the road [m].
-        scored: Agents whose features are wanted, boolean, shape (n_agents,); None for all. The others are seen.
-
-    Returns:
-        `FEATURE_NAMES` to values of shape (..., scored agents, T) in SI units, NaN where a feature does not exist;
-        those of collision and off-road are 0 or 1 by step.
-
+    Of n agents there are poses (..., n, T, 3): x along the road [m], y across it and positive to the right [m], heading
+    [rad], where leading axes may be rollouts; `valid` (n, T), where an agent is recorded, as nobody sees it elsewhere;
+    lengths and widths (n, 2) [m]; y of the left and the right edge of the road [m]. Agents that are `scored`, boolean
+    (n,), all if None, get `FEATURE_NAMES` with values (..., scored agents, T) in SI units, NaN where a feature does not
+    exist; those of collision and off-road are 0 or 1 by step.
     """
     if states.ndim > 3 and len(states) > AT_ONCE:  # small parts stay in the processor's cache
         parts = [motion_features(part, valid, sizes, edges, scored) for part in torch.split(states, AT_ONCE)]
@@ -152,13 +145,8 @@ def box_distance_of_sizes(
 ) -> Tensor:
     """Return the distance between rectangles [m], the negative depth of their overlap if they do.
 
-    Args:
-        along: Centre of the other from the centre of the first, along the first [m], shape (...).
-        across: The same across the first [m].
-        turn: Heading of the other less that of the first [rad].
-        size: Length and width of the first [m].
-        other_size: Of the other [m].
-
+    The centre of the other is so far along and across the first [m], its heading is turned [rad]; sizes are lengths and
+    widths [m].
     """
     cos, sin = torch.cos(turn), torch.sin(turn)
     other_along, other_across = along * cos + across * sin, across * cos - along * sin
@@ -278,18 +266,10 @@ def score_features(
     min_ade: float,
     copies: int = 1,
 ) -> SimAgentsScore:
-    """Return the score of features that `motion_features` gave.
+    """Return the score of features that `motion_features` gave: of rollouts (R, n, T), of the record (n, T).
 
-    Args:
-        simulated: Of the rollouts, shape (R, n, T) each.
-        recorded: Of the record, shape (n, T) each.
-        valid: Steps that count, boolean, shape (n, T).
-        settings: Histograms and weights.
-        min_ade: Kept in the score [m].
-        copies: As in `score_rollouts`.
-
-    Raises:
-        ValueError: If a recorded feature exists at no valid step.
+    `valid` (n, T) says which steps count; `min_ade` [m] is kept in the score; each rollout counts so many times. A
+    ValueError says that a recorded feature exists at no valid step.
     """
     likelihoods = {
         name: feature_likelihood(name, simulated[name], recorded[name], valid, settings[name], copies)
@@ -307,18 +287,9 @@ def _weighted(likelihoods: Mapping[str, float], settings: Settings, features: tu
 def feature_likelihood(
     name: str, simulated: Tensor, recorded: Tensor, valid: Tensor, setting: FeatureSetting, copies: int = 1
 ) -> float:
-    """Return the likelihood of a recorded feature, 0 to 1.
+    """Return the likelihood of a recorded feature, 0 to 1; shapes and errors as in `score_features`.
 
-    Args:
-        name: Of the feature; those in `EVENTS` count by whether they occur at any valid step.
-        simulated: Shape (R, n, T), NaN where the feature does not exist.
-        recorded: Shape (n, T), likewise.
-        valid: Which steps count, boolean, shape (n, T).
-        setting: Histogram.
-        copies: How often each rollout counts.
-
-    Raises:
-        ValueError: If the recorded feature exists at no valid step.
+    Features in `EVENTS` count by whether they occur at any valid step; elsewhere NaN says that there is no feature.
     """
     valid = valid & torch.isfinite(recorded)
     if not bool(valid.any()):
@@ -334,18 +305,9 @@ def feature_likelihood(
 def histogram_log_likelihood(
     simulated: Tensor, recorded: Tensor, valid: Tensor, setting: FeatureSetting, copies: int = 1
 ) -> Tensor:
-    """Return the logarithm of the probability of the recorded values' bins, of each agent's histogram.
+    """Return the logarithm of the probability of the recorded values' bins, of each agent's histogram, shape (n, T).
 
-    Args:
-        simulated: Shape (R, n, T); its values at valid steps, if finite, make the histogram of each of the n agents.
-        recorded: Shape (n, T).
-        valid: Boolean, shape (n, T); elsewhere the result means nothing.
-        setting: Histogram.
-        copies: How often each simulated value counts.
-
-    Returns:
-        Shape (n, T), double precision.
-
+    Simulated values (R, n, T) at valid steps (n, T), if finite, make the histogram of each of the n agents.
     """
     counted = (valid & torch.isfinite(simulated)).double()
     place = _bin_of(simulated, setting).movedim(0, 1).flatten(1)  # (n, R T)

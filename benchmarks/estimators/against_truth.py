@@ -9,7 +9,6 @@ interval holds the truth, simulations and gain.
 
 import json
 import math
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,29 +29,11 @@ SUM_BUDGET = 20_000
 SUM = "sum"
 
 
-@dataclass(frozen=True)
-class TruthComparison:
-    """One method on one problem."""
-
-    env_id: str
-    base: str
-    """Name of the base distribution, of a stratum, or "sum"."""
-    method: str
-    seeds: int
-    truth: float
-    mean: float
-    z: float
-    """(mean - truth) / standard error."""
-    coverage: float
-    cov: float
-    """Empirical c.o.v. of the estimates."""
-    own_cov: float
-    """Mean of the c.o.v. that the method reports."""
-    n_sim: float
-    gain: float
-    """(1 - p) / p / (n_sim x relative mean square error)."""
-    warned: float
-    """Share of results with a warning."""
+TruthComparison = dict[str, Any]
+"""One method on one problem: `env_id`; `base`, the name of the base distribution, of a stratum, or "sum"; `method`,
+`seeds`, `truth`, `mean`; `z`, (mean - truth) / standard error; `coverage`; `cov` of the estimates, and `own_cov`, the
+mean of those that the method reports; `n_sim`; `gain`, (1 - p) / p / (n_sim x relative mean square error); `warned`,
+the share of results with a warning."""
 
 
 def read_truths(path: Path = TRUTH_RESULT) -> list[dict[str, Any]]:
@@ -68,16 +49,7 @@ def read_truths(path: Path = TRUTH_RESULT) -> list[dict[str, Any]]:
 
 
 def compare_with_truth(row: dict[str, Any], method: str, seeds: range) -> TruthComparison:
-    """Repeat one method.
-
-    Args:
-        row: Entry of `truth.json`.
-        method: Command-line name of the method.
-        seeds: Seeds, one for each run.
-
-    Returns:
-        The comparison.
-    """
+    """Repeat one method, of a name as on the command line, by a row of `truth.json`, with one run for each seed."""
     problem: samplers.Problem = rare_envs.DrivingProblem(row["env_id"])
     if row["stratum"] != SUM:
         problem, _ = make_world(World(row["env_id"], row["base"], row["stratum"]))
@@ -86,21 +58,21 @@ def compare_with_truth(row: dict[str, Any], method: str, seeds: range) -> TruthC
     p, truth = np.array([run.p for run in runs]), row["p"]
     error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])
     n_sim = float(np.mean([run.n_sim for run in runs]))
-    return TruthComparison(
-        env_id=row["env_id"],
-        base=row["base"] or row["stratum"],
-        method=method,
-        seeds=len(p),
-        truth=truth,
-        mean=float(p.mean()),
-        z=float((p.mean() - truth) / error),
-        coverage=float(np.mean([run.interval[0] <= truth <= run.interval[1] for run in runs])),
-        cov=float(p.std(ddof=1) / truth),
-        own_cov=float(np.mean([run.cov for run in runs])),
-        n_sim=n_sim,
-        gain=float((1.0 - truth) / truth / (n_sim * np.mean((p / truth - 1.0) ** 2))),
-        warned=float(np.mean([bool(run.warnings) for run in runs])),
-    )
+    return {
+        "env_id": row["env_id"],
+        "base": row["base"] or row["stratum"],
+        "method": method,
+        "seeds": len(p),
+        "truth": truth,
+        "mean": float(p.mean()),
+        "z": float((p.mean() - truth) / error),
+        "coverage": float(np.mean([run.interval[0] <= truth <= run.interval[1] for run in runs])),
+        "cov": float(p.std(ddof=1) / truth),
+        "own_cov": float(np.mean([run.cov for run in runs])),
+        "n_sim": n_sim,
+        "gain": float((1.0 - truth) / truth / (n_sim * np.mean((p / truth - 1.0) ** 2))),
+        "warned": float(np.mean([bool(run.warnings) for run in runs])),
+    }
 
 
 @use_one_thread()
@@ -118,14 +90,10 @@ def main(
     for row in read_truths():
         for name in chosen if env in row["env_id"] else ():
             cell = compare_with_truth(row, name, range(first_seed, first_seed + seeds))
-            cells[cell.env_id, cell.base, cell.method] = asdict(cell)
-            print(
-                f"{cell.env_id:25s} {cell.base:16s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "
-                f"z {cell.z:+.2f} "
-                f"coverage {cell.coverage:.2f} cov {cell.cov:.3f} own {cell.own_cov:.3f} n_sim {cell.n_sim:.0f} "
-                f"gain {cell.gain:.1f} warned {cell.warned:.2f}",
-                flush=True,
-            )
+            cells[cell["env_id"], cell["base"], cell["method"]] = cell
+            figures = ("mean", "z", "coverage", "cov", "own_cov", "n_sim", "gain", "warned")
+            told = ", ".join(f"{each} {cell[each]:.3g}" for each in figures)
+            print(f"{cell['env_id']:25s} {cell['base']:16s} {cell['method']:9s} {told}", flush=True)
     command = f"python -m benchmarks.estimators.against_truth --seeds {seeds} --first-seed {first_seed}"
     out.write_text(json.dumps({"command": command, "cells": list(cells.values())}, indent=2) + "\n")
 

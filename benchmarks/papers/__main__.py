@@ -2,10 +2,9 @@
 
     python -m benchmarks.papers tian2024 --out runs/tian2024 --scale small
     python -m benchmarks.papers okelly2018 --out runs/okelly2018 --ego vision --at-most 2000
-    python -m benchmarks.papers renew runs/renewed --paper tian2024
 
 Each writes `reproduction.json`, `reproduction.md` and figures, and the single runs, with which the same command goes
-on. `renew` makes the rows of our own methods in the committed records anew.
+on.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from typing import Any
 
 from benchmarks.papers.okelly2018.reproduction import reproduce_okelly2018
 from benchmarks.papers.okelly2018.study import HighwayStudy, RolloutFolder
-from benchmarks.papers.renew import OWN_METHOD, PAPERS, renew
-from benchmarks.papers.tian2024.study import SCALES, TianPlan, reproduce_tian2024
+from benchmarks.papers.tian2024.replications import SCALES, TianPlan
+from benchmarks.papers.tian2024.study import reproduce_tian2024
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 
@@ -61,10 +60,6 @@ def _make_parser() -> argparse.ArgumentParser:
         command.add_argument("--out", type=Path, default=Path(name), help="folder of runs and record")
         command.add_argument("--workers", type=int, default=1, help="processes")
         command.add_argument("--json", action="store_true", help="print the record")
-    renewed = commands.add_parser("renew", help="rows of our own methods in the committed records, made anew")
-    renewed.add_argument("folder", type=Path, help="of the new runs")
-    renewed.add_argument("--paper", choices=PAPERS, help="one record; all if none is named")
-    renewed.add_argument("--method", default=OWN_METHOD, help="methods with commas; none makes no row")
     return parser
 
 
@@ -107,12 +102,7 @@ def _tell(record: Mapping[str, Any], arguments: argparse.Namespace) -> None:
     print(f"Wrote {arguments.out / 'reproduction.json'} and {arguments.out / 'reproduction.md'}.")
 
 
-def _run_renewal(arguments: argparse.Namespace) -> None:
-    papers = PAPERS if arguments.paper is None else (arguments.paper,)
-    renew(arguments.folder, papers, [name for name in arguments.method.split(",") if name])
-
-
-_COMMANDS = {"tian2024": _run_tian, "okelly2018": _run_okelly, "renew": _run_renewal}
+_COMMANDS = {"tian2024": _run_tian, "okelly2018": _run_okelly}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -14,6 +14,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 import rare_envs
+from benchmarks import format_table
 from benchmarks.samplers.runs import about
 from rare_envs.files import format_json
 from rare_envs.study.arguments import BadInput
@@ -58,18 +59,9 @@ def make_table(
 ) -> Entry:
     """Return a table of a paper beside ours, with the explanations that its values have as reasons, or that these name.
 
-    Args:
-        name: A word, unique in the record: `table2`.
-        title: Its title.
-        keys: Heads of the columns of the labels.
-        values: Numbers, see `compare`.
-        explanations: Sentences by the names that the values have as reasons.
-        measured: Rows of ours alone, shown below: `labels`, and `values` by quantity, the same quantities in every row.
-        measured_title: Of these.
-        all_in_title: Of the columns with every simulation counted.
-
-    Raises:
-        ValueError: A row has other labels than the table, or a reason is not explained.
+    The name is unique in the record, `table2`; keys are heads of the labels, values are of `compare`. Below are rows
+    that we alone have measured: `labels`, and `values` by quantity, the same ones in every row. A ValueError says that
+    a row has other labels than the table, or that a reason is not explained.
     """
     for row in (*values, *measured):
         if len(row["labels"]) != len(keys):
@@ -97,31 +89,21 @@ def find(
     return {"claim": claim, "statistic": statistic, "value": value, "interval": interval, "verdict": verdict}
 
 
-def make_record(
-    *,
-    title: str,
-    source: str,
-    command: str,
-    settings: Mapping[str, Any],
-    tables: Sequence[Entry],
-    figures: Mapping[str, Entry],
-    findings: Sequence[Entry] = (),
-    notes: Sequence[str] = (),
-    runs: Sequence[Mapping[str, Any]] = (),
-) -> Entry:
+def make_record(settings: Mapping[str, Any], **content: Any) -> Entry:
     """Return a record as plain values for JSON.
 
-    The settings are whatever the numbers depend on; figures have their data by names, with `caption` and `paper`: what
-    they show, and what the printed ones show; notes hold for all of it; the runs are the single ones.
+    The settings are whatever the numbers depend on. The content has title, source and command; tables; figures, which
+    have their data by names, with `caption` and `paper`: what they show, and what the printed ones show; findings;
+    notes, which hold for all of it; and the single runs.
     """
-    libraries = {name: _find_version(name) for name in ("torch", "numba", "gymnasium")}
+    libraries = {name: find_version(name) for name in ("torch", "numba", "gymnasium")}
     made = about(rare_envs=rare_envs.__version__, **libraries, **settings)
-    content = {"notes": notes, "tables": tables, "findings": findings, "figures": figures, "runs": runs}
-    record: Entry = to_json_value({"title": title, "source": source, "command": command, "about": made, **content})
+    record: Entry = to_json_value({**content, "about": made})
     return record
 
 
-def _find_version(library: str) -> str:
+def find_version(library: str) -> str:
+    """Return the version of a library, which need not be installed."""
     try:
         return version(library)
     except PackageNotFoundError:
@@ -141,24 +123,15 @@ def write_record(out: Path, record: Mapping[str, Any], figures: Drawings) -> Non
 def check_folder(out: Path, study: Mapping[str, Any]) -> None:
     """Raise BadInput if a folder, which need not exist, has runs of another study, as their first lines say."""
     for file in sorted(out.glob("*.jsonl")):
-        held = _read_study(file)
-        if held is not None and held != study:
+        first, whole, _ = file.read_text(encoding="utf-8", errors="replace").partition("\n")
+        try:
+            held = dict(json.loads(first)["study"])
+        except (ValueError, KeyError, TypeError):
+            held = {}
+        if whole and held != study:
             raise BadInput(
                 f"{out} holds {_describe_study(held)}; this is {_describe_study(study)}: choose another --out."
             )
-
-
-def _read_study(file: Path) -> Mapping[str, Any] | None:
-    """Return what the runs of a file are of; None for a file without a whole line."""
-    with file.open(encoding="utf-8", errors="replace") as lines:
-        first = lines.readline()
-    if not first.endswith("\n"):
-        return None
-    try:
-        study = json.loads(first)["study"]
-    except (ValueError, KeyError, TypeError):
-        return {}
-    return study if isinstance(study, dict) else {}
 
 
 def _describe_study(study: Mapping[str, Any]) -> str:
@@ -177,7 +150,7 @@ def format_record(record: Mapping[str, Any]) -> str:
         if table["measured"]:
             heads = [*table["keys"], *table["measured"][0]["values"]]
             rows = [[*row["labels"], *map(format_number, row["values"].values())] for row in table["measured"]]
-            lines += [f"{table['measured_title']}:", "", *_format_rows(heads, rows), ""]
+            lines += [f"{table['measured_title']}:", "", format_table(heads, rows), ""]
         lines += [f"- *{name}*: {text}" for name, text in table["explanations"].items()]
     if record["findings"]:
         rows = [
@@ -185,7 +158,7 @@ def format_record(record: Mapping[str, Any]) -> str:
             for row in record["findings"]
         ]
         lines += ["", "### Findings", ""]
-        lines += _format_rows(["statement", "statistic", "value", "95 % interval", "here"], rows)
+        lines += [format_table(["statement", "statistic", "value", "95 % interval", "here"], rows)]
     lines += ["", "### Figures", ""] if record["figures"] else []
     lines += [
         f"- {each['title']} {each['caption']} In the paper: {each['paper']}" for each in record["figures"].values()
@@ -212,7 +185,7 @@ def _format_compared(table: Mapping[str, Any]) -> Iterator[str]:
         notes += [f"- {', '.join(labels)}: {quantity}: {'; '.join(said)}"] * bool(said)
     heads = list(dict.fromkeys(head for cells in rows.values() for head in cells))
     body = [[*labels, *(cells.get(head, NOTHING) for head in heads)] for labels, cells in rows.items()]
-    yield from _format_rows([*table["keys"], *(f"{head}: paper / ours" for head in heads)], body)
+    yield format_table([*table["keys"], *(f"{head}: paper / ours" for head in heads)], body)
     yield from ("", *notes) if notes else ()
 
 
@@ -238,9 +211,3 @@ def format_number(value: float | None) -> str:
 def format_ends(interval: Sequence[float] | None) -> str:
     """Return the ends of an interval as text."""
     return NOTHING if interval is None else f"{format_number(interval[0])} to {format_number(interval[1])}"
-
-
-def _format_rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(heads)} |"
-    yield "|---" * len(heads) + "|"
-    yield from (f"| {' | '.join(row)} |" for row in rows)

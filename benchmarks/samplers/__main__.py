@@ -38,7 +38,7 @@ from typing import Any
 from scipy import stats
 
 import rare_envs
-from benchmarks.results_page import format_table
+from benchmarks import format_table
 from benchmarks.run_lines import RunLines
 from benchmarks.samplers.other_libraries import OTHER_SOLVERS
 from benchmarks.samplers.problems import GROUPS, find_problem, list_problems

@@ -33,17 +33,10 @@ Solver = Callable[..., EstimateNumbers]
 def solve_with_openturns(
     make: Callable[[Any], Any], share: int, problem: FunctionProblem, seed: int, max_sim: int | None
 ) -> EstimateNumbers:
-    """Run an algorithm of OpenTURNS on P[f(U) <= 0], U ~ N(0, I).
+    """Run an algorithm of OpenTURNS, which `make` makes from the event, on P[f(U) <= 0], U ~ N(0, I).
 
-    Args:
-        make: Makes the algorithm from the event.
-        share: Levels, or parts, that the budget is divided into; 0 to stop at the budget.
-        problem: With f and the number of dimensions.
-        seed: Of OpenTURNS' generator.
-        max_sim: Simulations of a run, about; None for 5,000.
-
-    Raises:
-        RuntimeError: The algorithm or f failed, with the last line of what OpenTURNS says.
+    The budget, about `max_sim` simulations, None for 5,000, is divided into so many levels or parts; with 0 the run
+    stops there. A RuntimeError has the last line of what OpenTURNS says.
     """
     import openturns
 

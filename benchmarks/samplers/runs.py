@@ -154,7 +154,7 @@ def run_once(job: Job) -> MethodRun:
     watched: Any = limit_state(job.problem).problem(rotation, job.seed, meter.watch)
     answer: dict[str, Any] = {**dict.fromkeys(("p", "low", "high", "cov"), math.nan), "status": "raised"}
     error, start = "", time.process_time()
-    with use_one_core():
+    with threadpool_limits(1):  # linear algebra uses one thread
         try:
             run: Any = partial(estimate, watched, method) if isinstance(method, Stepping) else partial(method, watched)
             answer = read_answer(run(seed=job.seed, max_sim=job.max_sim))
@@ -176,12 +176,7 @@ def run_once(job: Job) -> MethodRun:
 
 
 def read_answer(answer: Any) -> dict[str, Any]:
-    """Return what a method said, as the fields of a `MethodRun`.
-
-    Raises:
-        TypeError: It is neither a result nor three or four numbers.
-        ValueError: One of them is NaN.
-    """
+    """Return what a method said, as the fields of a `MethodRun`; an error if that is no result, nor numbers, or NaN."""
     if isinstance(answer, Estimate):
         said = {"status": str(answer.status), "warnings": tuple(answer.warnings), "stated": answer.n_sim}
         return {"p": answer.p, "low": answer.interval[0], "high": answer.interval[1], "cov": answer.cov, **said}
@@ -196,16 +191,9 @@ def read_answer(answer: Any) -> dict[str, Any]:
 def map_jobs(
     once: Callable[[_Job], _Run], jobs: Iterable[_Job], workers: int = 1, executor: Executor | None = None
 ) -> Iterator[_Run]:
-    """Return what a function gives for jobs of any kind, in order, from this process or from several.
+    """Yield what a function gives for jobs of any kind, in order, from this process, from several, or an executor.
 
-    Args:
-        once: Makes one of them.
-        jobs: What it is called with.
-        workers: Processes; with 1 the runs are made in this one.
-        executor: Where the runs are made instead, for example a dask client's.
-
-    Raises:
-        ChildProcessError: A worker process ended in the midst of a run.
+    A ChildProcessError says that a worker process ended in the midst of a run.
     """
     if executor is not None:
         yield from executor.map(once, jobs)
@@ -220,26 +208,16 @@ def map_jobs(
                 raise ChildProcessError("A worker process ended in the midst of a run.") from None
 
 
-def use_one_core() -> threadpool_limits:
-    """Return a context in which linear algebra uses one thread."""
-    return threadpool_limits(limits=1)
-
-
 def about(**settings: Any) -> dict[str, Any]:
     """Return the machine, the versions and the settings that figures were measured with."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
-        "processor": _processor(),
+        "processor": names[0] if names else platform.processor() or platform.machine(),
         "system": platform.platform(),
         "python": platform.python_version(),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
         **settings,
     }
-
-
-def _processor() -> str:
-    """Return the processor's name where the system tells it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()

@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
@@ -106,19 +107,6 @@ def exact_p(base: TruncatedGaussianMixture, limit: float) -> float:
     return float(stats.norm.sf(limit, mean, math.sqrt(variance)))
 
 
-@dataclass(frozen=True, eq=False)
-class Exceedance:
-    """The problem of a fitted base: f = limit - X in `DIRECTION`."""
-
-    base: FittedDistribution
-    limit: float
-    dim: int = DIM
-
-    def evaluate(self, x: FloatArray) -> FloatArray:
-        """Return f, (n, d) -> (n,)."""
-        return np.asarray(self.limit - x @ DIRECTION)
-
-
 @dataclass(frozen=True)
 class Repetition:
     """One draw of events, fitted, estimated and compared with the truth."""
@@ -144,7 +132,8 @@ def repeat(world: World, seed: int) -> Repetition:
     """Draw events from a world, fit, estimate and compare."""
     rng = np.random.default_rng([seed, world.events, world.clusters])
     base = fit_base(world.draw(rng), world, rng)
-    result = samplers.estimate(Exceedance(base, world.limit), seed=seed, max_sim=MAX_SIM)
+    problem: Any = SimpleNamespace(dim=DIM, base=base, evaluate=lambda x: world.limit - x @ DIRECTION)
+    result = samplers.estimate(problem, seed=seed, max_sim=MAX_SIM)
     return compare_with_truth(result, world.p, np.array([exact_p(refit, world.limit) for refit in base.refits]))
 
 

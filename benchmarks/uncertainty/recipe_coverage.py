@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario
-from samplers.problem import FloatArray
 from training.fit.base import fit_base
 from training.fit.filters import EventSet
 
@@ -88,19 +88,6 @@ def merge_components(mixture: TruncatedGaussianMixture) -> TruncatedGaussianMixt
     return TruncatedGaussianMixture(np.ones(1), mean[None], covariance[None], coordinates=mixture.coordinates)
 
 
-@dataclass(frozen=True, eq=False)
-class ShortTimeToCollision:
-    """The problem of a fitted base: f = limit - closing speed / gap."""
-
-    base: FittedDistribution
-    limit: float
-    dim: int = 3
-
-    def evaluate(self, x: FloatArray) -> FloatArray:
-        """Return f [1/s], (n, 3) -> (n,)."""
-        return np.asarray(self.limit - (x[:, 0] - x[:, 1]) / x[:, 2])
-
-
 @dataclass(frozen=True)
 class FittedRepetition:
     """One repetition, and what the recipe chose in it."""
@@ -121,7 +108,8 @@ def repeat_recipe(world: RecipeWorld, seed: int, n_refits: int | None = None) ->
     """
     events = world.draw(np.random.default_rng([seed, world.events, world.components]))
     base = fit_base(SCENARIO, events, {}, "", n_refits=n_refits, seed=seed)
-    result = samplers.estimate(ShortTimeToCollision(base, world.limit), seed=seed, max_sim=MAX_SIM)
+    problem: Any = SimpleNamespace(dim=3, base=base, evaluate=lambda x: world.limit - (x[:, 0] - x[:, 1]) / x[:, 2])
+    result = samplers.estimate(problem, seed=seed, max_sim=MAX_SIM)
     assert isinstance(base.distribution, TruncatedGaussianMixture)
     components = len(base.distribution.weights)
     return FittedRepetition(

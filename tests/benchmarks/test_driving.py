@@ -39,9 +39,9 @@ def test_an_ego_is_measured_and_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(egos, "EGOS_RESULT", tmp_path / "egos.json")
     assert read_results() == {}
     cell = evaluate_ego("rare_envs/CarFollowing-v0", "idm", "auto", 10, tmp_path, at_most=1000)
-    assert (cell.words.partition(",")[0], cell.steps) == ("rear_end", 0)
-    assert 0 < cell.low < cell.p < cell.high and cell.n_sim <= 1000
-    write_results({(cell.env_id, cell.ego): cell})
+    assert (cell["words"].partition(",")[0], cell["steps"]) == ("rear_end", 0)
+    assert 0 < cell["low"] < cell["p"] < cell["high"] and cell["n_sim"] <= 1000
+    write_results({(cell["env_id"], cell["ego"]): cell})
     assert read_results() == {("rare_envs/CarFollowing-v0", "idm"): cell}
 
 

@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from benchmarks.estimators import against_truth
-from benchmarks.estimators.against_truth import TruthComparison
 from benchmarks.estimators.highway import gains
 from benchmarks.estimators.highway import truth as highway_truth
-from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS, HighwayCase
+from benchmarks.estimators.highway.truth import CASES, COUNTED_WORLDS, EARLIER_COUNTS, HighwayCase
 from benchmarks.estimators.truth import ROLLOUT_CHUNK, World, count_collisions, truth
 from rare_envs.simulation.world import rollout
 
@@ -81,11 +80,11 @@ def test_rows_of_one_method_or_environment_are_made_anew_and_the_others_stay(
 ) -> None:
     calls: list[tuple[str, str]] = []
 
-    def compare(row: dict[str, Any], method: str, seeds: range) -> TruthComparison:
+    def compare(row: dict[str, Any], method: str, seeds: range) -> dict[str, Any]:
         calls.append((row["env_id"], method))
         figures = {"mean": row["p"], "z": 0.0, "coverage": 1.0, "cov": 0.1, "own_cov": 0.1, "n_sim": 100.0}
         names = {"env_id": row["env_id"], "base": row["base"], "method": method}
-        return TruthComparison(**names, seeds=len(seeds), truth=row["p"], **figures, gain=7.0, warned=0.0)
+        return {**names, "seeds": len(seeds), "truth": row["p"], **figures, "gain": 7.0, "warned": 0.0}
 
     monkeypatch.setattr(against_truth, "compare_with_truth", compare)
     out = tmp_path / "cells.json"

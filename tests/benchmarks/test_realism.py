@@ -10,7 +10,7 @@ import torch
 from agents import LearnedDriver
 from agents.learned.networks import HUMAN_NOISE, WeightDistribution, head_weights
 from benchmarks.driving import realism, realism_score
-from benchmarks.driving.realism import constant_velocity, format_table, measure_all
+from benchmarks.driving.realism import constant_velocity, format_realism, measure_all
 from benchmarks.driving.realism_score import average_scenes, by_features, find_starts, simulate
 from benchmarks.driving.realism_score import judge as judge_start
 from benchmarks.driving.sim_agents import (
@@ -47,7 +47,7 @@ def test_a_report_has_every_row(recording, driver, monkeypatch):
     assert one["vehicles"] == 2 * (6 + 6 + 5) * 2  # scenes, starts at 0, 2 and 4 s, sequences of noise
     assert one["collision"] == pytest.approx(np.mean(one["collisions"]))
     assert one["standard_error"]["mean_speed"] > 0
-    table = format_table(rows, "3 s")
+    table = format_realism(rows, "3 s")
     assert all(f"| {name} |" in table for name in names)
 
 

@@ -16,8 +16,7 @@ import typer
 import rare_envs
 import samplers
 from benchmarks import RESULTS
-from benchmarks.estimators.highway.cases import CASES, WORLDS
-from benchmarks.estimators.highway.truth import HIGHWAY_TRUTH, Proportion, read_truth
+from benchmarks.estimators.highway.truth import CASES, HIGHWAY_TRUTH, WORLDS, Proportion, read_truth
 from rare_envs.files import replace_text
 from rare_envs.startup import use_one_thread
 

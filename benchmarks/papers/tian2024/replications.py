@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from benchmarks.samplers.runs import use_one_core
+import rare_envs
+from benchmarks.run_lines import RunLines
 from rare_envs.problem import DrivingProblem
 from samplers import (
     AdaptiveSubsetSimulation,
@@ -101,6 +105,46 @@ class ReplicationJob(NamedTuple):
     """Whether points of the levels are kept, for Figure 7."""
 
 
+REPLICATIONS_FILE = "runs.jsonl"
+SCALES = {"small": 5, "full": 20}
+"""Replications by scale; the paper has 20."""
+
+
+@dataclass(frozen=True)
+class TianPlan:
+    """What is to be run."""
+
+    replications: int = SCALES["full"]
+    seed: int = 0
+    """Of the first replication; the others have the seeds that follow."""
+
+    def __post_init__(self) -> None:
+        if self.replications < 2:
+            raise ValueError(f"Expected 2 replications at least, for a spread, got {self.replications}.")
+        if self.seed < 0:
+            raise ValueError(f"Expected a seed of at least 0, got {self.seed}.")
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What tells reproductions apart."""
+        return {"paper": "tian2024", "replications": self.replications, "seed": self.seed}
+
+    def jobs(self) -> list[ReplicationJob]:
+        """Return the replications: the paper's methods, then further ones, Monte Carlo at the end."""
+        own = [name for name, row in METHOD_ROWS.items() if row.paper and name != "MC"]
+        further = [name for name, row in METHOD_ROWS.items() if not row.paper]
+        return [
+            ReplicationJob(
+                scenario, system, method, self.seed + k, points=method == FIGURE7_METHOD and scenario == "cut-in"
+            )
+            for methods in (own, further, ["MC"])
+            for k in range(self.replications)
+            for scenario in SCENARIO_ROWS
+            for system in SYSTEMS
+            for method in methods
+        ]
+
+
 RUN_COLUMNS = ("seed", "p", "low", "high", "cov", "n_sim", "simulated", "final", "levels")
 """Figures of a run: seed, estimate and interval; simulations that the method states, all that were made, counted
 outside the method, and those behind the estimate (without a search); levels, iterations or batches."""
@@ -121,6 +165,18 @@ def read_run(content: dict[str, Any]) -> Run:
 def row_of(run: Run) -> Key:
     """Return where a run stands in the tables."""
     return run["scenario"], run["system"], run["method"]
+
+
+def open_replications(out: Path, plan: TianPlan) -> RunLines[ReplicationJob, Run]:
+    """Return the replications of a folder."""
+    return RunLines(
+        out / REPLICATIONS_FILE,
+        {"study": plan.identity, "rare_envs": rare_envs.__version__},
+        read_run,
+        dict,
+        key_of_job=lambda job: job[:4],
+        key_of_run=lambda run: (*row_of(run), run["seed"]),
+    )
 
 
 class CountedSimulations:
@@ -164,7 +220,7 @@ def run_replication(job: ReplicationJob) -> Run:
     """Make one replication."""
     row = METHOD_ROWS[job.method]
     problem = CountedSimulations(driving_problem(job.scenario, job.system))
-    with use_one_core():
+    with threadpool_limits(1):
         result = estimate(
             problem,
             row.on_stack if job.system == "stack" and row.on_stack else row.method,

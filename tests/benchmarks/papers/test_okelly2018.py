@@ -16,7 +16,6 @@ import torch
 import samplers
 from benchmarks.papers.okelly2018 import findings, reproduction
 from benchmarks.papers.okelly2018 import study as study_module
-from benchmarks.papers.okelly2018.estimates import compare_with_naive, estimate_naive, estimate_weighted
 from benchmarks.papers.okelly2018.findings import (
     PaperClaim,
     RunBehaviour,
@@ -31,23 +30,34 @@ from benchmarks.papers.okelly2018.findings import (
     speed_behind,
     spread_of_starts,
 )
-from benchmarks.papers.okelly2018.reproduction import reproduce_okelly2018, summarise_highway, write_notes
-from benchmarks.papers.okelly2018.search import (
+from benchmarks.papers.okelly2018.reproduction import (
+    compare_with_naive,
+    estimate_naive,
+    estimate_weighted,
+    reproduce_okelly2018,
+    summarise_highway,
+    write_notes,
+)
+from benchmarks.papers.okelly2018.study import (
     CORE_SPEEDS,
     PRINTED_SEARCH,
     SEARCHES,
     STUDY_SCALES,
+    HighwayStudy,
+    RolloutFolder,
     SearchSettings,
     StudyScale,
     choose_sampler,
     describe_sampler,
     draw_chunk,
     find_log_ratios,
+    join_outcomes,
     make_base,
+    measure_highway,
+    split_jobs,
     take_step,
 )
-from benchmarks.papers.okelly2018.study import HighwayStudy, RolloutFolder, join_outcomes, measure_highway, split_jobs
-from benchmarks.papers.renew import read_records
+from benchmarks.results_page import read
 from rare_envs.simulation import drive
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
@@ -397,9 +407,9 @@ def test_a_full_scale_that_is_not_all_run_says_what_the_rest_takes(monkeypatch: 
 # the committed records
 
 
-@pytest.fixture(scope="module", params=[name for name in read_records() if name.startswith("okelly")])
+@pytest.fixture(scope="module", params=["okelly2018", "okelly2018_full", "okelly2018_vision"])
 def committed(request: pytest.FixtureRequest) -> dict[str, Any]:
-    return read_records()[request.param]
+    return read(request.param)
 
 
 def study_of(record: dict[str, Any]) -> HighwayStudy:
@@ -418,7 +428,7 @@ def test_the_first_rollouts_are_those_of_the_committed_run(committed: dict[str, 
 
 def test_the_first_iteration_of_a_search_made_again_is_the_committed_one(highway: Any) -> None:
     """Of the small scale: 1,000 rollouts."""
-    record = read_records()["okelly2018"]
+    record = read("okelly2018")
     study, name = study_of(record), "starts alone, rho 0.1"
     base, number = make_base(highway, SEARCHES[name]), list(SEARCHES).index(name) + 1
     (job,) = split_jobs(f"search_{number}/0", study.settings.draws, study.settings.chunk, base)
@@ -432,7 +442,7 @@ def test_the_first_iteration_of_a_search_made_again_is_the_committed_one(highway
 @pytest.mark.slow
 def test_rows_of_the_committed_table_are_what_the_command_makes_again(out: Path) -> None:
     """Naive Monte Carlo with as many draws as a final sample has, and our default method at one threshold."""
-    record = read_records()["okelly2018"]
+    record = read("okelly2018")
     study = study_of(record)
     with use_one_thread():
         problem = study.make_problem()

@@ -12,16 +12,25 @@ import pytest
 from scipy import stats
 
 from benchmarks.papers.tian2024 import study
-from benchmarks.papers.tian2024.printed import EXPLANATIONS, PRINTED, PrintedRow
 from benchmarks.papers.tian2024.replications import (
     CountedSimulations,
     ReplicationJob,
+    TianPlan,
     driving_problem,
     read_run,
     run_replication,
 )
-from benchmarks.papers.tian2024.study import TianPlan, reproduce_tian2024
-from benchmarks.papers.tian2024.summary import assess_claims, derive, ends_of, ratio_of_work, summarise_runs
+from benchmarks.papers.tian2024.study import reproduce_tian2024
+from benchmarks.papers.tian2024.summary import (
+    EXPLANATIONS,
+    PRINTED,
+    PrintedRow,
+    assess_claims,
+    derive,
+    ends_of,
+    ratio_of_work,
+    summarise_runs,
+)
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
 from tests.benchmarks.papers.made_runs import made_run
