@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.control.idm import check_numbers
 from rare_envs.devices import constant, fixed_draws, move_to
 from rare_envs.egos.policy import as_driver
 from rare_envs.sensors.lidar import perceive_traffic
@@ -69,10 +70,7 @@ class Stack:
     """Largest change of the steering angle [rad/s]."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)  # a field by its name
-            if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
-                raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
+        check_numbers(self, "stack", {"of at least 0, finite": [each.name for each in fields(self)]})
         if not self.missed < 1.0 or not (self.jerk and self.steering_rate):
             got = f"{self.missed:g}, {self.jerk:g} and {self.steering_rate:g}"
             raise ValueError(f"Expected missed below 1, and jerk and steering_rate above 0, got {got}.")

@@ -31,13 +31,13 @@ from agents.learned.networks import (
 )
 from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges, Seen
 from rare_envs.control import actions
-from rare_envs.control.idm import IDM
+from rare_envs.control.idm import IDM, yaw_rate_towards
 from rare_envs.devices import constant
 from rare_envs.sensors.lidar import AHEAD_BEAM, CURVATURE_COLUMN, FEATURES, MAX_RANGE, SPEED_COLUMN
 from rare_envs.simulation.cuda_graphs import says_recordable
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
 from rare_envs.traffic.bodies import Lead
-from rare_envs.traffic.state import NEAR_ZERO, steering_for
+from rare_envs.traffic.state import steering_for
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -46,10 +46,6 @@ if TYPE_CHECKING:
 
 EASED_BEYOND = 2.0
 """Deceleration [m/s^2] that is comfortable, as in `CollisionAvoidance`."""
-OFFSET_TIME = 0.6
-"""The lateral speed that is aimed at is lane offset / this [s], as in `rare_envs.control.idm`."""
-HEADING_TIME = 0.2
-"""The yaw rate is heading error / this [s], as in `rare_envs.control.idm`."""
 _NOISE_SIZE = 2 * ACTION_SIZE
 """Numbers that a vehicle keeps in mind of its noise."""
 _POLICY, _WEIGHTS = "policy.", "weights."
@@ -307,9 +303,7 @@ class RuleDriver:
         ahead = seen.ranges[..., AHEAD_BEAM]
         gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * seen.length, torch.inf)
         acceleration = self.idm.acceleration(seen.speed, Lead(gap, -seen.rates[..., AHEAD_BEAM]))
-        across = -seen.offset / (OFFSET_TIME * seen.speed.clamp(min=NEAR_ZERO))
-        wanted = torch.asin(across.clamp(-1.0, 1.0)).clamp(-torch.pi / 4, torch.pi / 4)
-        yaw_rate = ((wanted - seen.heading) / HEADING_TIME).clamp(*self.yaw_rate)
+        yaw_rate = yaw_rate_towards(seen.offset, seen.heading, seen.speed).clamp(*self.yaw_rate)
         return torch.stack((acceleration, yaw_rate), dim=-1), memory
 
 
@@ -368,13 +362,16 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
     sizes = (FEATURE_SIZE, FEATURE_SIZE, ACTION_SIZE, ACTION_SIZE)
     policy = files.read_network(lambda: Policy(Scaling(*map(torch.empty, sizes))), tensors, path, _POLICY)
     rule, changes = header.get("avoidance"), header.get("changes")  # earlier files have none
+    names = () if header["radius"] is None else ("mean", "rows", "columns", "precision")
+    files.require(tensors, [_WEIGHTS + name for name in names], path)
+    arrays = {name: tensors[_WEIGHTS + name].numpy() for name in names}
     try:
         return LearnedDriver(
             policy,
             colour=AutoregressiveNoise(**header["colour"]),
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
-            weights=None if header["radius"] is None else _read_weights(tensors, header["radius"], path),
+            weights=WeightDistribution.from_arrays(arrays, header["radius"]) if arrays else None,
             avoidance=None if rule is None else CollisionAvoidance(**rule),
             hard_braking=header.get("hard_braking", 1.0),
             changes=None if changes is None else LaneChanges(**changes),
@@ -382,10 +379,3 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
         )
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"{str(path)!r} is no usable driver: {error}") from None
-
-
-def _read_weights(tensors: dict[str, Tensor], radius: float, path: Path) -> WeightDistribution:
-    """Return the distribution of the last layer's weights in a file's tensors."""
-    names = ("mean", "rows", "columns", "precision")
-    files.require(tensors, [_WEIGHTS + name for name in names], path)
-    return WeightDistribution.from_arrays({name: tensors[_WEIGHTS + name].numpy() for name in names}, radius)

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rare_envs.control.idm import check_numbers
 from rare_envs.devices import constant
 from rare_envs.sensors import lidar
 from rare_envs.sensors.lidar import AHEAD_BEAM, FEATURES, MAX_RANGE
@@ -138,7 +139,8 @@ class CollisionAvoidance:
     """A point in the own lane is in the path if it is no further than this beside the own body [m]."""
 
     def __post_init__(self) -> None:
-        _check_positive(self, "collision avoidance")
+        numbers = [each.name for each in fields(self)]
+        check_numbers(self, "collision avoidance", {"above 0, finite": numbers})
 
     def limit(self, seen: Seen, action: Tensor) -> Tensor:
         """Return accelerations [m/s^2] and yaw rates [rad/s] (B, M, 2) within the bounds."""
@@ -323,7 +325,8 @@ class LaneChanges:
                 f"Expected {len(COVARIATES)} finite coefficients of the hazard, got {self.coefficients!r}."
             )
         object.__setattr__(self, "coefficients", coefficients)
-        _check_positive(self, "lane changes")
+        numbers = [each.name for each in fields(self) if each.name != "coefficients"]
+        check_numbers(self, "lane changes", {"above 0, finite": numbers})
 
     def begin(self, draws: Tensor) -> ChangeState:
         """Return the state before anything was perceived, from standard normal draws (B, M, 2)."""
@@ -457,11 +460,3 @@ def patience_of(draws: Tensor) -> Tensor:
 def _of_side(values: Tensor, side: Tensor) -> Tensor:
     """Return the values (..., 2) of a side, -1 or 1, shape (...); of the right for 0."""
     return torch.where(side < 0.0, values[..., 0], values[..., 1])
-
-
-def _check_positive(settings: Any, of: str) -> None:
-    """Refuse a field of one number that is not a positive one."""
-    for name in (each.name for each in fields(settings) if isinstance(each.default, float)):
-        value = getattr(settings, name)  # a field by its name
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
-            raise ValueError(f"Expected {name} of the {of} above 0, got {value!r}.")

@@ -338,9 +338,15 @@ class RemoteEgo:
         raise RemoteError(f"The ego at {self._link.address} failed twice on this batch: {reason}")
 
     def _restore(self, session: _Session) -> None:
-        """Connect if need be, begin a session on the server if it does not know it, bring it to the present tick."""
+        """Connect anew, to the same ego, if need be; bring a session that the server does not know to this tick."""
         if not self._connected:
-            self._reconnect()
+            gone = f"The ego at {self._link.address} went away, and"
+            try:
+                hello = self._connect()
+            except (RemoteError, MalformedMessage) as error:
+                raise EgoGone(f"{gone} what is there now refuses: {error}") from error
+            if (hello.get("observation"), hello.get("action")) != self._spaces:
+                raise EgoGone(f"{gone} one with other spaces is there now.")
         if session.epoch == self._epoch:
             return
         self._request({"type": "reset", "session": session.number, "batch": session.batch}, self._timeout)
@@ -397,16 +403,6 @@ class RemoteEgo:
         self._epoch += 1
         self._connected, self._warm = True, False
         return reply
-
-    def _reconnect(self) -> None:
-        """Connect again, to the same ego."""
-        gone = f"The ego at {self._link.address} went away, and"
-        try:
-            hello = self._connect()
-        except (RemoteError, MalformedMessage) as error:
-            raise EgoGone(f"{gone} what is there now refuses: {error}") from error
-        if (hello.get("observation"), hello.get("action")) != self._spaces:
-            raise EgoGone(f"{gone} one with other spaces is there now.")
 
     def close(self) -> None:
         """End the connection."""

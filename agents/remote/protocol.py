@@ -212,20 +212,16 @@ def decode_space(given: Any, nested: bool = False) -> spaces.Space[Any] | None:
         _check_shape(given["shape"], _MAX_ENTRIES)
         dtype: Any = np.uint8 if given.get("dtype") == "|u1" else np.float32
         widest = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
-        low, high = (
-            _decode_bound(given.get(end), given["shape"], limit).clip(*widest).astype(dtype)
-            for end, limit in zip(("low", "high"), widest, strict=True)
-        )
+        bounds = []
+        for end, limit in zip(("low", "high"), widest, strict=True):  # one number, or one for every entry
+            bound = np.asarray(limit if given.get(end) is None else given[end], dtype=np.float64)
+            demand(not np.isnan(bound).any(), "a bound is NaN")
+            whole = bound.reshape(given["shape"]) if bound.ndim else np.full(given["shape"], bound)
+            bounds.append(whole.clip(*widest).astype(dtype))
+        low, high = bounds
         return spaces.Box(low, high, dtype=dtype)
     except Exception as error:  # the server may have sent anything
         raise MalformedMessage(f"a space {show(given, 100)}: {reason_of(error):.200}") from error
-
-
-def _decode_bound(given: Any, shape: list[int], limit: float) -> NDArray[np.float64]:
-    """Return a bound for every entry, shape `shape`."""
-    bound = np.asarray(limit if given is None else given, dtype=np.float64)
-    demand(not np.isnan(bound).any(), "a bound is NaN")
-    return bound.reshape(shape) if bound.ndim else np.full(shape, bound)
 
 
 # --- secrets -------------------------------------------------------------------------------------

@@ -279,26 +279,21 @@ def is_loopback(address: str) -> bool:
 
 
 def main(address: str, arguments: str) -> None:
-    """Load an ego and answer for it, as long as the process that started this one is there."""
+    """Load an ego and answer for it, or give the reason why not, as long as the process that started this one lives."""
+    from agents.loading import load_ego
+
     parent = os.getppid()
     with use_one_thread():
-        handle = _load_handler(arguments)
+        try:
+            ego = load_ego(**json.loads(arguments))
+            if not is_policy(ego):
+                raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
+            handle = RequestHandler(ego).handle
+        except (ValueError, OSError) as error:
+            refusal = protocol.pack({"type": "error", "code": "ego", "reason": str(error), "id": None})
+            handle = lambda connection, content: refusal  # noqa: E731
         router = _make_router(zmq.Context.instance())
         router.connect(address)
         while os.getppid() == parent:
             _answer_next(router, handle)
     shutil.rmtree(Path(address.removeprefix("ipc://")).parent, ignore_errors=True)  # which nobody else will remove
-
-
-def _load_handler(arguments: str) -> Callable[[bytes, bytes], bytes]:
-    """Return what answers for an ego; where it cannot be loaded, every answer is the reason."""
-    from agents.loading import load_ego
-
-    try:
-        ego = load_ego(**json.loads(arguments))
-        if not is_policy(ego):
-            raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
-    except (ValueError, OSError) as error:
-        refusal = {"type": "error", "code": "ego", "reason": str(error), "id": None}
-        return lambda connection, content: protocol.pack(refusal)
-    return RequestHandler(ego).handle

@@ -68,7 +68,7 @@ def check_numbers(model: object, who: str, ranges: Mapping[str, Sequence[str]]) 
     for words, names in ranges.items():
         for name in names:
             value = getattr(model, name)
-            if not isinstance(value, Real) or not RANGES[words](float(value)):
+            if isinstance(value, bool) or not isinstance(value, Real) or not RANGES[words](float(value)):
                 raise ValueError(f"Expected {name} of the {who} to be a number {words}, got {value!r}.")
 
 

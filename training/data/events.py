@@ -46,7 +46,7 @@ MEAN_SECONDS, ANSWER_SECONDS = 2.0, 3.0
 MEAN_REACH = 3
 """Ticks on either side of the later moment whose mean speed is taken."""
 ANSWERS = ("mean_a_ego", "braking_ego", "mean_a_cutin", "braking_cutin")
-"""Columns of what follows the start of a cut-in: those of `measure_answer` of the ego and of the cutter."""
+"""Columns of what follows the start of a cut-in: those of `measure_answers` of the ego and of the cutter."""
 SHORTEST_TRACK = 42
 """Ticks below which a track is too short to show a braking."""
 
@@ -100,18 +100,6 @@ def bumper_gaps(trajectories: Trajectories, behind: NDArray[np.int64], before: N
     return np.where((behind >= 0) & (before >= 0), value, np.nan)
 
 
-def _find_lane_changes(t: Trajectories) -> NDArray[np.int64]:
-    """Return rows that are the first in a neighbouring lane, `MIN_LANE_FRAMES` or more in one lane on either side."""
-    new_track = np.isin(np.arange(len(t)), t.track_starts())
-    runs = np.flatnonzero(new_track | np.append(True, np.diff(t.lane) != 0))
-    length = np.diff(np.append(runs, len(t)))
-    settled = (length[1:] >= MIN_LANE_FRAMES) & (length[:-1] >= MIN_LANE_FRAMES)
-    lane, before = t.lane[runs[1:]], t.lane[runs[:-1]]
-    neighbours = (np.abs(lane - before) == 1) & (lane > 0) & (before > 0)
-    crossings: NDArray[np.int64] = runs[1:][settled & neighbours & ~new_track[runs[1:]]]
-    return crossings
-
-
 def _find_course(t: Trajectories, crossing: int, first: int, last: int) -> tuple[int, bool, float]:
     """Return the row at which a lane change began, whether that was recorded, and the duration of its course [s].
 
@@ -145,7 +133,7 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         shape (2 changes,). Ego is the nearest vehicle behind in the new lane, lead the nearest ahead in it, -1 and NaN
         if there is none. Gaps are bumper to bumper (negative: side by side). Also the lateral offset from ego [m];
         `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s]; `duration` of the cubic course that
-        moves across for as long [s], NaN if start or end was not recorded; of ego and cutter, see `measure_answer`,
+        moves across for as long [s], NaN if start or end was not recorded; of ego and cutter, see `measure_answers`,
         the mean acceleration and the hardest braking that follow [m/s^2].
 
     Example:
@@ -158,8 +146,13 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         >>> cuts["phase"].tolist(), cuts["vehicle"].tolist(), cuts["to_lane"].tolist()
         (['crossing', 'start'], [4, 4], [3, 3])
     """
-    t = trajectories
-    breaks, crossings = t.track_starts(), _find_lane_changes(t)
+    t, breaks = trajectories, trajectories.track_starts()
+    new_track = np.isin(np.arange(len(t)), breaks)
+    runs = np.flatnonzero(new_track | np.append(True, np.diff(t.lane) != 0))  # of frames in one lane
+    settled = np.diff(np.append(runs, len(t))) >= MIN_LANE_FRAMES
+    lane, before = t.lane[runs[1:]], t.lane[runs[:-1]]
+    neighbours = (np.abs(lane - before) == 1) & (lane > 0) & (before > 0)
+    crossings = runs[1:][settled[1:] & settled[:-1] & neighbours & ~new_track[runs[1:]]]
     track = np.searchsorted(breaks, crossings, side="right") - 1
     spans = np.column_stack([crossings, breaks[track], np.append(breaks[1:], len(t))[track] - 1])
     courses = np.array([_find_course(t, *span) for span in spans.tolist()]).reshape(-1, 3)
@@ -195,35 +188,24 @@ def cut_in_events(trajectories: Trajectories) -> Events:
 def measure_answers(
     breaks: NDArray[np.int64], position: FloatArray, speed: FloatArray, rows: NDArray[np.int64]
 ) -> FloatArray:
-    """Return what follows rows of tracks one behind the other, (n, 2), see `measure_answer`; NaN if a row is -1.
+    """Return mean accelerations over the 2 s after rows, and the hardest braking in 3 s [m/s^2], (n, 2).
 
-    The tracks begin at the rows `breaks`; position [m] and speed [m/s] are theirs.
+    The rows are of tracks one behind the other, which begin at the rows `breaks`; position along the road [m] and speed
+    as recorded [m/s] are theirs. The later speed is the mean of 0.7 s about its moment, as speeds jitter; the braking
+    is that of the positions smoothed at 0.40 Hz, 0 if there is none. NaN if the track ends before, or a row is -1.
     """
     ends = np.append(breaks, len(position))
     track = np.searchsorted(breaks, rows, side="right") - 1
-    spans = np.column_stack([rows, ends[track], ends[track + 1]]).tolist()
-    found = [
-        measure_answer(position[first:end], speed[first:end], row - first) if row >= 0 else (np.nan, np.nan)
-        for row, first, end in spans
-    ]
-    return np.array(found).reshape(-1, 2)
-
-
-def measure_answer(position: FloatArray, speed: FloatArray, at: int) -> tuple[float, float]:
-    """Return the mean acceleration over the 2 s after a tick of a track, and the hardest braking in 3 s [m/s^2].
-
-    Position along the road [m] and speed as recorded [m/s] have shape (T,). The later speed is the mean of 0.7 s
-    about its moment, as speeds jitter; the braking is that of the positions smoothed at 0.40 Hz, 0 if there is
-    none. NaN if the track ends before.
-    """
-    later, last = at + round(MEAN_SECONDS / DT), at + round(ANSWER_SECONDS / DT)
-    mean, braking = np.nan, np.nan
-    if later < len(speed):
-        reach = min(MEAN_REACH, len(speed) - 1 - later)
-        mean = (speed[later - reach : later + reach + 1].mean() - speed[at]) / MEAN_SECONDS
-    if last < len(position):
-        braking = max(-_smooth_motion(position)[1][at : last + 1].min(), 0.0)
-    return float(mean), float(braking)
+    found = np.full((len(rows), 2), np.nan)
+    for answer, (row, first, end) in zip(found, zip(rows, ends[track], ends[track + 1], strict=True), strict=True):
+        later, last = row + round(MEAN_SECONDS / DT), row + round(ANSWER_SECONDS / DT)
+        if row >= 0 and later < end:
+            reach = min(MEAN_REACH, end - 1 - later)
+            answer[0] = (speed[later - reach : later + reach + 1].mean() - speed[row]) / MEAN_SECONDS
+        if row >= 0 and last < end:
+            acceleration = _smooth_motion(position[first:end])[1]
+            answer[1] = max(-acceleration[row - first : last - first + 1].min(), 0.0)
+    return found
 
 
 def _find_neighbours(

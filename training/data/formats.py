@@ -275,7 +275,16 @@ def load_coifman_li(path: Path | str, *, length: float = MEAN_LENGTH, gaps: Gaps
         [1.524, 3.048, 4.572]
     """
     path = Path(path)
-    rows = read_matrix(path, COIFMAN_LI, _read_mat(path) if path.suffix.lower() == ".mat" else None)
+    matrix = None
+    if path.suffix.lower() == ".mat":
+        try:
+            open_ordinary(path).close()
+            matrix = np.asarray(loadmat(path, variable_names=["data"]).get("data"))
+        except (OSError, ValueError, TypeError, NotImplementedError, MatReadError, zlib.error) as error:
+            raise ValueError(f"Cannot read {path}: {error}") from None
+        if matrix.ndim != 2 or matrix.dtype.kind not in "fiu":
+            raise ValueError(f"{path} has no matrix of numbers 'data'; is it the file of Coifman and Li?")
+    rows = read_matrix(path, COIFMAN_LI, matrix)
     if filled := [COIFMAN_LI[name].names[0] for name in COIFMAN_EMPTY if rows[name].any()]:
         raise ValueError(
             f"{path} has values in {' and '.join(filled)}, which are empty in the data of Coifman and Li; is it a "
@@ -292,18 +301,6 @@ def load_coifman_li(path: Path | str, *, length: float = MEAN_LENGTH, gaps: Gaps
         "leader": np.where(rows["leader"] > 0, rows["leader"], NOBODY),
     }
     return tabulate(columns)
-
-
-def _read_mat(path: Path) -> FloatArray:
-    """Return the matrix `data` of a MATLAB file."""
-    try:
-        open_ordinary(path).close()
-        data = np.asarray(loadmat(path, variable_names=["data"]).get("data"))
-    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError, zlib.error) as error:
-        raise ValueError(f"Cannot read {path}: {error}") from None
-    if data.ndim != 2 or data.dtype.kind not in "fiu":
-        raise ValueError(f"{path} has no matrix of numbers 'data'; is it the file of Coifman and Li?")
-    return data.astype(np.float64)
 
 
 def highd_recordings(folder: Path | str) -> tuple[str, ...]:
@@ -458,28 +455,21 @@ def _tgsim_directions(rows: Rows, name: str, gaps: Gaps) -> Iterator[tuple[dict[
     forward = (np.bincount(index, move @ spread) >= 0.0)[index]
     for chosen in (forward, ~forward):
         if chosen.any():
-            yield _tgsim_columns(rows.select(chosen), name, frame[chosen], move[chosen].sum(axis=0), gaps)
-
-
-def _tgsim_columns(
-    rows: Rows, name: str, frame: FloatArray, heading: FloatArray, gaps: Gaps
-) -> tuple[dict[str, NDArray[Any]], tuple[float, ...]]:
-    """Return the columns of the table and the lane boundaries of one direction of travel."""
-    numbers = rows["lane"].astype(np.int64)
-    x, y = fit_road_axis(rows["x"], rows["y"], numbers, heading).project(rows["x"], rows["y"])
-    check_tracks(rows, rows["vehicle"], frame, x, rows["speed"], DT, gaps)
-    lane = number_lanes(y, numbers)
-    along = int(abs(heading[1]) > abs(heading[0]))
-    columns = {
-        **_take(rows, "vehicle speed acceleration length width"),
-        "recording": np.full(len(rows), f"{name}-{TGSIM_DIRECTIONS[int(heading[along] < 0.0)][along]}"),
-        "frame": frame,
-        "x": x,
-        "y": y,
-        "lane": lane,
-        "leader": find_leaders(rows["vehicle"], frame, lane, x + 0.5 * rows["length"]),
-    }
-    return columns, estimate_lane_edges(y, lane)
+            part, heading = rows.select(chosen), move[chosen].sum(axis=0)
+            numbers, vehicle, moment = part["lane"].astype(np.int64), part["vehicle"], frame[chosen]
+            x, y = fit_road_axis(part["x"], part["y"], numbers, heading)(part["x"], part["y"])
+            check_tracks(part, vehicle, moment, x, part["speed"], DT, gaps)
+            lane, along = number_lanes(y, numbers), int(abs(heading[1]) > abs(heading[0]))
+            columns = {
+                **_take(part, "vehicle speed acceleration length width"),
+                "recording": np.full(len(part), f"{name}-{TGSIM_DIRECTIONS[int(heading[along] < 0.0)][along]}"),
+                "frame": moment,
+                "x": x,
+                "y": y,
+                "lane": lane,
+                "leader": find_leaders(vehicle, moment, lane, x + 0.5 * part["length"]),
+            }
+            yield columns, estimate_lane_edges(y, lane)
 
 
 def load_i24_motion(

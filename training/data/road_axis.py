@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -28,67 +28,48 @@ LANE_SPACINGS = (2.5, 5.0)
 """Least and greatest distance [m] between the centres of neighbouring lanes: US freeways have lanes of 3.0 to 3.7 m."""
 
 
-@dataclass(frozen=True)
-class RoadAxis:
-    """Curve along a road in the plane: w = curve(u) [m] in a frame turned about an origin so that u follows the road.
+Projection = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""From x and y (n,) to distances along a curve in the plane and across it, positive to the right [m], (n,) each."""
 
-    The frame is right-handed to (x, y): with y downwards, as in pictures, w is to the right of u.
+
+def fit_road_axis(x: FloatArray, y: FloatArray, lane: NDArray[np.int64], heading: FloatArray) -> Projection:
+    """Return the projection on a road's axis, by positions [m] and lanes (n,) and a rough direction of travel (2,).
+
+    The axis is w = curve(u) in a frame turned so that u follows the road. The frame is right-handed to (x, y): with y
+    downwards, as in pictures, w is to the right of u. A cubic spline (penalised as in Eilers and Marx, "Flexible
+    smoothing with B-splines and penalties", 1996) is fitted to the mean positions in each lane every `BIN`, together
+    with one distance for each lane. The road may turn by less than a right angle; ramps, which do not keep their
+    distance, pull at the axis by their share of the traffic.
     """
-
-    origin: FloatArray
-    direction: FloatArray
-    """Unit vector of u, shape (2,)."""
-    curve: BSpline
-    u: FloatArray
-    """Points of the table of lengths [m], shape (n,)."""
-    station: FloatArray
-    """Length of the axis up to these points [m], shape (n,)."""
-
-    def project(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return distances along the axis and across it, positive towards w [m], shape (n,) each."""
-        u, w = _turn(x, y, self.origin, self.direction)
-        foot, slope = u, self.curve.derivative()
-        for _ in range(FOOT_STEPS):
-            rise = slope(foot)
-            foot = foot + ((u - foot) + rise * (w - self.curve(foot))) / (1.0 + rise**2)
-        rise = slope(foot)
-        across = ((w - self.curve(foot)) - rise * (u - foot)) / np.sqrt(1.0 + rise**2)
-        ends = (foot - np.clip(foot, self.u[0], self.u[-1])) * np.sqrt(1.0 + rise**2)
-        return np.interp(foot, self.u, self.station) + ends, across
-
-
-def _turn(x: FloatArray, y: FloatArray, origin: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return x and y (n,) in the frame at an origin with the first axis in a direction."""
-    dx, dy = x - origin[0], y - origin[1]
-    return dx * direction[0] + dy * direction[1], dy * direction[0] - dx * direction[1]
-
-
-def fit_road_axis(x: FloatArray, y: FloatArray, lane: NDArray[np.int64], heading: FloatArray) -> RoadAxis:
-    """Return the axis of the lanes of a road, of positions [m] and lanes (n,) and a rough direction of travel (2,).
-
-    A cubic spline (penalised as in Eilers and Marx, "Flexible smoothing with B-splines and penalties", 1996) is fitted
-    to the mean positions in each lane every `BIN`, together with one distance for each lane. The road may turn by less
-    than a right angle; ramps, which do not keep their distance, pull at the axis by their share of the traffic.
-    """
-    origin = np.array([x.mean(), y.mean()])
+    origin = x.mean(), y.mean()
     axis = np.linalg.eigh(np.cov(np.stack([x, y])))[1][:, -1]
-    direction = axis * (1.0 if axis @ heading >= 0.0 else -1.0)
-    u, w = _turn(x, y, origin, direction)
-    curve = _fit_spline(*_average_bins(u, w, lane))
-    points = np.append(np.arange(u.min(), u.max(), TABLE_STEP), u.max())
-    steps = np.hypot(np.diff(points), np.diff(curve(points)))
-    return RoadAxis(origin, direction, curve, points, np.append(0.0, np.cumsum(steps)))
+    cos, sin = axis * (1.0 if axis @ heading >= 0.0 else -1.0)
 
+    def turn(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        dx, dy = x - origin[0], y - origin[1]
+        return dx * cos + dy * sin, dy * cos - dx * sin
 
-def _average_bins(
-    u: FloatArray, w: FloatArray, lane: NDArray[np.int64]
-) -> tuple[FloatArray, FloatArray, NDArray[np.int64], FloatArray]:
-    """Return mean u and w, the index of the lane and the number of rows for each lane and `BIN`."""
-    lanes, index = np.unique(lane, return_inverse=True)
+    u, w = turn(x, y)
+    lanes, index = np.unique(lane, return_inverse=True)  # mean u and w, and the number of rows, of each lane and `BIN`
     place = np.floor((u - u.min()) / BIN).astype(np.int64)
     cells, cell, count = np.unique(index.ravel() + len(lanes) * place, return_inverse=True, return_counts=True)
-    means = [np.bincount(cell.ravel(), values) / count for values in (u, w)]
-    return means[0], means[1], cells % len(lanes), count.astype(np.float64)
+    mean_u, mean_w = (np.bincount(cell.ravel(), values) / count for values in (u, w))
+    curve = _fit_spline(mean_u, mean_w, cells % len(lanes), count.astype(np.float64))
+    slope, points = curve.derivative(), np.append(np.arange(u.min(), u.max(), TABLE_STEP), u.max())
+    station = np.append(0.0, np.cumsum(np.hypot(np.diff(points), np.diff(curve(points)))))  # length up to the points
+
+    def project(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        u, w = turn(x, y)
+        foot = u
+        for _ in range(FOOT_STEPS):
+            rise = slope(foot)
+            foot = foot + ((u - foot) + rise * (w - curve(foot))) / (1.0 + rise**2)
+        rise = slope(foot)
+        across = ((w - curve(foot)) - rise * (u - foot)) / np.sqrt(1.0 + rise**2)
+        ends = (foot - np.clip(foot, points[0], points[-1])) * np.sqrt(1.0 + rise**2)
+        return np.interp(foot, points, station) + ends, across
+
+    return project
 
 
 def _fit_spline(u: FloatArray, w: FloatArray, lane: NDArray[np.int64], weight: FloatArray) -> BSpline:

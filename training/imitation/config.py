@@ -9,21 +9,17 @@ from agents.learned.networks import HUMAN_NOISE, WHITE_NOISE, AutoregressiveNois
 
 NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
 
+ANNEAL = 0.7
+"""Share of the training in which the schedules run."""
+LAST_RATE = 0.1
+"""Share of the learning rates of policy and critic that is left at the end. They fall once the schedules have ended, so
+that the policy settles: only that of the last update is kept."""
 _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
-    (
-        "updates batch pools scenes horizon age drivers critic_steps critic_batch memory ppo_epochs ppo_batch",
-        lambda value: value >= 1,
-        ">= 1",
-    ),
-    (
-        "epochs warm_up weight_decay gradient_penalty critic_weight collision_weight edge_weight brake_weight "
-        "headway_weight lane_weight speed_weight",
-        lambda value: 0 <= value < math.inf,
-        ">= 0",
-    ),
-    ("clone_weight clone_rate policy_rate critic_rate value_rate clip", lambda value: 0 < value < math.inf, "> 0"),
-    ("anneal last_rate", lambda value: 0 < value <= 1, "in (0, 1]"),
-    ("credit discount gae", lambda value: 0 <= value <= 1, "in [0, 1]"),
+    ("updates batch pools scenes horizon age critic_batch ppo_batch", lambda value: value >= 1, ">= 1"),
+    ("clone_weight clone_rate policy_rate", lambda value: 0 < value < math.inf, "> 0"),
+    ("epochs warm_up weight_decay", lambda value: 0 <= value < math.inf, ">= 0"),
+    ("critic_weight collision_weight edge_weight brake_weight", lambda value: 0 <= value < math.inf, ">= 0"),
+    ("headway_weight lane_weight speed_weight", lambda value: 0 <= value < math.inf, ">= 0"),
 )
 """Names of settings, the condition on each value, and its text. Schedules of weights are geometric, so not 0."""
 
@@ -32,7 +28,8 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
 class Config:
     """Settings of the training of a driver; the command line has an option for each.
 
-    Pairs are values at the start and at the end of a schedule.
+    Pairs are values at the start and at the end of a schedule. What all trainings have in common is in
+    `training.imitation.learner`.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -61,8 +58,6 @@ class Config:
     """Learning rate of behaviour cloning."""
     weight_decay: float = 1e-4
     """Weight decay of behaviour cloning."""
-    log_std_cap: float = 0.0
-    """Upper bound of the logarithm of the standard deviation, see `agents.learned.networks.Policy`."""
 
     # rollouts
     pools: int = 5
@@ -74,16 +69,12 @@ class Config:
     """Number of ticks of a rollout."""
     age: tuple[int, int] = (30, 150)
     """Number of ticks after which a pool is restarted from the record."""
-    drivers: tuple[int, int] = (60, 60)
-    """Most vehicles of a scene that are driven: a curriculum over the number of agents (Bhattacharyya et al. 2018)."""
 
     # costs of the policy
     critic_weight: float = 3.0
     """Weight of the critic in the cost."""
     clone_weight: tuple[float, float] = (0.1, 0.06)
     """Weight of the likelihood of recorded actions, a geometric schedule."""
-    anneal: float = 0.7
-    """Share of the training in which the schedules run."""
     collision_weight: float = 16.0
     """Weight of collisions in the cost."""
     edge_weight: float = 16.0
@@ -100,37 +91,14 @@ class Config:
     # optimisation
     policy_rate: float = 3e-4
     """Learning rate of the policy."""
-    critic_rate: float = 4e-4
-    """Learning rate of the critic."""
-    last_rate: float = 0.1
-    """Share of the learning rates of policy and critic that is left at the end. They fall once the schedules have
-    ended, so that the policy settles: only that of the last update is kept."""
-    critic_steps: int = 3
-    """Updates of the critic in each update of the policy."""
     critic_batch: int = 512
     """Batch size of the critic."""
-    memory: int = 8
-    """Number of rollouts that the critic learns from."""
     warm_up: int = 30
     """Number of rounds in which only the critic learns."""
-    gradient_penalty: float = 0.5
-    """Weight of the gradient penalty of the critic."""
-    credit: float = 0.97
-    """Of MGAIL: share of the gradient of the state that is passed on to the tick before."""
 
     # GAIL, by proximal policy optimisation
-    discount: float = 0.97
-    """Discount factor of rewards."""
-    gae: float = 0.95
-    """Factor lambda of generalised advantage estimation."""
-    clip: float = 0.2
-    """Clipping range of the probability ratio."""
-    ppo_epochs: int = 4
-    """Epochs of each update."""
     ppo_batch: int = 2048
     """Batch size of each update."""
-    value_rate: float = 1e-3
-    """Learning rate of the value function."""
 
     def __post_init__(self) -> None:
         if self.method not in ("gail", "mgail"):
@@ -149,13 +117,13 @@ class Config:
         return NOISES[self.noise]
 
     def rate_factor(self, update: int) -> float:
-        """Return the factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
-        start = self.anneal * self.updates
-        return 1.0 - (1.0 - self.last_rate) * min(max((update - start) / max(self.updates - start, 1.0), 0.0), 1.0)
+        """Return the factor of the learning rates at an update: 1, then linearly down to `LAST_RATE`."""
+        start = ANNEAL * self.updates
+        return 1.0 - (1.0 - LAST_RATE) * min(max((update - start) / max(self.updates - start, 1.0), 0.0), 1.0)
 
     def share(self, update: int) -> float:
         """Return how far the schedules have come at an update, 0 to 1."""
-        return min(update / max(self.anneal * self.updates, 1.0), 1.0)
+        return min(update / max(ANNEAL * self.updates, 1.0), 1.0)
 
     def geometric_schedule(self, ends: tuple[float, float], update: int) -> float:
         """Return the value at an update of a schedule between two ends."""

@@ -76,12 +76,10 @@ def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: 
     return act
 
 
-def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
-    """Return scenes and ticks of starts every few seconds from the start of every scene, shape (B,) each."""
-    stride = round(seconds / DT)
-    starts = [
-        (scene, tick) for scene, ticks in enumerate(recording.ticks.tolist()) for tick in range(0, ticks - 1, stride)
-    ]
+def regular_starts(recording: Recording) -> tuple[Tensor, Tensor]:
+    """Return scenes and ticks of starts every 2 s from the start of every scene, shape (B,) each."""
+    stride = round(2.0 / DT)
+    starts = [(scene, at) for scene, ticks in enumerate(recording.ticks.tolist()) for at in range(0, ticks - 1, stride)]
     scene, tick = torch.tensor(starts).T
     return scene, tick
 
@@ -120,8 +118,12 @@ def find_overlaps(traffic: Traffic, m: int) -> Tensor:
 
 def drive_recording(
     recording: Recording, act: Act, ticks: int, starts: tuple[Tensor, Tensor]
-) -> tuple[Behaviour, Errors | None]:
-    """Return the behaviour of driven vehicles from some starts on, and their errors after `ERROR_TIME` if it lasts."""
+) -> tuple[Behaviour, dict[str, Tensor] | None]:
+    """Return the behaviour of driven vehicles from some starts on, and their errors after `ERROR_TIME` if it lasts.
+
+    Errors are differences from the record of the n vehicles that are still recorded: position and lateral [m], speed
+    [m/s], (n,) each, and the scene of each vehicle.
+    """
     traffic, memory, errors = start_replay(recording, *starts), None, None
     m = traffic.drivers
     driven, unused = traffic.driven[:, :m], torch.zeros(len(traffic.x), traffic.x.shape[1] - m, 2)
@@ -129,7 +131,16 @@ def drive_recording(
     rows = []
     for tick in range(ticks):
         if tick == round(ERROR_TIME / DT):
-            errors = current_errors(recording, traffic)
+            at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
+            recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
+            known = recorded & traffic.driven & (traffic.tick == at)[:, None]
+            along, across, speed = (
+                (getattr(traffic, name) - getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle))[known]
+                for name in ("x", "y", "speed")  # fields by name
+            )
+            position = (along.square() + across.square()).sqrt()
+            scene = traffic.scene[:, None].expand_as(known)[known]
+            errors = {"scene": scene, "position": position, "speed": speed, "lateral": across}
         features = replay_features(traffic, m)
         action, memory = act(features, memory)
         contact = (find_overlaps(traffic, m) & ~overlapping).any(dim=2)
@@ -174,24 +185,6 @@ def _row(traffic: Traffic, features: Tensor, action: Tensor, contact: Tensor, ch
     return traffic.speed[:, :m], *action.unbind(dim=-1), ahead, rate, contact, off_road, changed
 
 
-Errors = dict[str, Tensor]
-"""Differences from the record of the n vehicles that are still recorded: position and lateral [m], speed [m/s], (n,)
-each, and the scene of each vehicle."""
-
-
-def current_errors(recording: Recording, traffic: Traffic) -> Errors:
-    """Return differences of driven vehicles from their recorded places at this tick."""
-    at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
-    recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
-    known = recorded & traffic.driven & (traffic.tick == at)[:, None]
-    fields = ("x", "y", "speed")  # by name
-    records = (getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle) for name in fields)
-    along, across, speed = ((getattr(traffic, n) - r)[known] for n, r in zip(fields, records, strict=True))
-    position = (along.square() + across.square()).sqrt()
-    scene = traffic.scene[:, None].expand_as(known)[known]
-    return {"scene": scene, "position": position, "speed": speed, "lateral": across}
-
-
 Tallies = dict[str, FloatArray]
 """Sums over the vehicle-steps of each of S scenes by name, (S,) each: `steps`, those with a hard brake, in collision,
 off the road and with a lane change, and of their speed; `vehicles`, and those that `ever` collide; "bins QUANTITY",
@@ -215,7 +208,7 @@ def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
     return {name: (values[where], scene[-len(where) :][where]) for name, (values, where) in quantities.items()}
 
 
-def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Tallies:
+def sum_by_scene(behaviour: Behaviour, scenes: int, errors: dict[str, Tensor] | None = None) -> Tallies:
     """Return the tallies of some behaviour in S scenes, with errors after 5 s where these are known."""
     known = behaviour.known
 

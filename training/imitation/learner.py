@@ -28,20 +28,33 @@ from torch import Tensor, nn
 from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, AutoregressiveNoise, Policy, Scaling
 from training.checkpoints import read_checkpoint, write_checkpoint
 from training.imitation.config import Config
-from training.imitation.rollout import (
+from training.imitation.traffic import (
+    Pairs,
     Penalties,
+    Recording,
     RolloutSteps,
     ScenePool,
+    Traffic,
     draw_pool,
     normalise_action,
     roll_out,
     total_cost,
 )
-from training.imitation.traffic import Pairs, Recording, Traffic
 
 Log = dict[str, float]
 POLICY_BETAS, CRITIC_BETAS = (0.9, 0.99), (0.5, 0.9)
 """Decay rates of Adam's two moments, for policy and critic."""
+CRITIC_RATE, VALUE_RATE = 4e-4, 1e-3
+"""Learning rates of critic and value."""
+CRITIC_STEPS, MEMORY, GRADIENT_PENALTY = 3, 8, 0.5
+"""Updates of the critic in each update of the policy, rollouts that it learns from, weight of its gradient penalty."""
+MOST = 60
+"""Vehicles of a scene that are driven at most."""
+CREDIT = 0.97
+"""Of MGAIL: share of the gradient of the state that is passed on to the tick before."""
+DISCOUNT, GAE_LAMBDA, CLIP, PPO_EPOCHS = 0.97, 0.95, 0.2, 4
+"""Of proximal policy optimisation: discount of rewards, lambda of generalised advantage estimation, clipping range of
+the probability ratio, epochs of an update."""
 MAX_GRADIENT_NORM = 1.0
 """Norm to which the gradient of the policy is clipped."""
 HIDDEN_UNITS, LEAK = 128, 0.2
@@ -77,7 +90,7 @@ def make_seeded(make: Callable[[], Module], generator: torch.Generator) -> Modul
 
 def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
     """Return a new policy that maximises the likelihood of recorded actions; further epochs overfit."""
-    policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator).to(pairs.features.device)
+    policy = make_seeded(lambda: Policy(scaling_of(pairs)), generator).to(pairs.features.device)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
     action = normalise_action(policy, pairs.action)
     for _ in range(config.epochs):
@@ -96,24 +109,19 @@ def descend(optimiser: torch.optim.Optimizer, loss: Tensor, clipped: nn.Module |
     return norm
 
 
-def _network(activation: Callable[[], nn.Module]) -> nn.Sequential:
-    """Return a network on features and actions: 53-128-128-1 units."""
+def make_network(activation: Callable[[], nn.Module]) -> nn.Sequential:
+    """Return a network of 53-128-128-1 units on pairs of features and actions (n, 53), whose output is (n,).
+
+    A critic's is large where driving looks recorded.
+    """
     sizes = (FEATURE_SIZE + ACTION_SIZE, HIDDEN_UNITS, HIDDEN_UNITS)
     hidden = [layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), activation())]
-    return nn.Sequential(*hidden, nn.Linear(HIDDEN_UNITS, 1))
+    return nn.Sequential(*hidden, nn.Linear(HIDDEN_UNITS, 1), nn.Flatten(0))
 
 
-class Critic(nn.Module):
-    """Network of 53-128-128-1 units with LeakyReLU; its output is large where driving looks recorded."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = _network(lambda: nn.LeakyReLU(LEAK))
-
-    def forward(self, pairs: Tensor) -> Tensor:
-        """Return the logits (n,) of pairs (n, 53), see `critic_inputs`."""
-        logits: Tensor = self.layers(pairs)[:, 0]
-        return logits
+def make_critic() -> nn.Sequential:
+    """Return a new critic, with LeakyReLU."""
+    return make_network(lambda: nn.LeakyReLU(LEAK))
 
 
 def critic_inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
@@ -121,7 +129,7 @@ def critic_inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
     return torch.cat((policy.normalise(features), action), dim=1)
 
 
-def policy_cost(critic: Critic, pairs: Tensor) -> Tensor:
+def policy_cost(critic: nn.Module, pairs: Tensor) -> Tensor:
     """Return -log of the probability that a pair is recorded, softplus(-logit), shape (n,).
 
     GAIL's paper minimises log(1 - D) of the probability D of the policy; this keeps a gradient where it is recognised.
@@ -129,7 +137,9 @@ def policy_cost(critic: Critic, pairs: Tensor) -> Tensor:
     return nn.functional.softplus(-critic(pairs))
 
 
-def critic_loss(critic: Critic, recorded: Tensor, made: Tensor, penalty: float, generator: torch.Generator) -> Tensor:
+def critic_loss(
+    critic: nn.Module, recorded: Tensor, made: Tensor, penalty: float, generator: torch.Generator
+) -> Tensor:
     """Return the logistic loss with a penalty on the mean squared gradient between recorded and made pairs (n, 53)."""
     share = torch.rand(len(recorded), 1, generator=generator).to(recorded.device)
     between = (share * recorded + (1.0 - share) * made).requires_grad_(True)
@@ -149,7 +159,7 @@ class Learner:
     pairs: Pairs
     """Recorded driving for the critic and the likelihood."""
     policy: Policy
-    critic: Critic
+    critic: nn.Module
     generator: torch.Generator
     update: int = 0
     simulated: int = 0
@@ -159,11 +169,11 @@ class Learner:
         """Make optimisers, pools and the critic's memory; numbers are drawn on the CPU, the same for every device."""
         config, self.device = self.config, self.recording.x.device
         self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=POLICY_BETAS)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=CRITIC_BETAS)
-        self.value = make_seeded(lambda: _network(nn.Tanh), self.generator).to(self.device)
-        self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), CRITIC_RATE, betas=CRITIC_BETAS)
+        self.value = make_seeded(lambda: make_network(nn.Tanh), self.generator).to(self.device)
+        self.value_optimiser = torch.optim.Adam(self.value.parameters(), VALUE_RATE)
         self.pools: list[ScenePool] = []
-        self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
+        self.rollouts: deque[Tensor] = deque(maxlen=MEMORY)
         self.clone_pairs = self.pairs.features, normalise_action(self.policy, self.pairs.action)
         self.recorded = critic_inputs(self.policy, *self.clone_pairs)
 
@@ -171,20 +181,13 @@ class Learner:
         """Return the value at this update of a linear schedule of whole numbers."""
         return round(ends[0] + (ends[1] - ends[0]) * self.config.share(self.update))
 
-    def set_rates(self) -> None:
-        """Set the learning rates of this update."""
-        factor, config = self.config.rate_factor(self.update), self.config
-        self.policy_optimiser.param_groups[0]["lr"] = factor * config.policy_rate
-        self.critic_optimiser.param_groups[0]["lr"] = factor * config.critic_rate
-
     def drive(self, credit: float) -> RolloutSteps:
         """Drive the next pool for a horizon; a pool that is too old is restarted from the record."""
         config, horizon = self.config, self.linear_schedule(self.config.horizon)
         index, oldest = self.update % config.pools, self.linear_schedule(config.age)
 
         def start() -> ScenePool:
-            most = self.linear_schedule(config.drivers)
-            return draw_pool(self.recording, self.among, config.scenes, most, horizon, config.colour, self.generator)
+            return draw_pool(self.recording, self.among, config.scenes, MOST, horizon, config.colour, self.generator)
 
         while len(self.pools) < config.pools:
             self.pools.append(start())
@@ -202,10 +205,10 @@ class Learner:
         self.rollouts.append(critic_inputs(self.policy, steps.features.detach(), steps.action.detach()))
         made = torch.cat(tuple(self.rollouts))
         loss = torch.zeros(())
-        for _ in range(config.critic_steps):
+        for _ in range(CRITIC_STEPS):
             rows = torch.randint(len(self.recorded), (config.critic_batch,), generator=generator)
             other = torch.randint(len(made), (config.critic_batch,), generator=generator)
-            loss = critic_loss(self.critic, self.recorded[rows], made[other], config.gradient_penalty, generator)
+            loss = critic_loss(self.critic, self.recorded[rows], made[other], GRADIENT_PENALTY, generator)
             descend(self.critic_optimiser, loss)
         return float(loss.detach())
 
@@ -247,13 +250,16 @@ class Learner:
 def run_updates(learner: Learner) -> Iterator[Log]:
     """Make the remaining updates of a training, which may have been resumed, one by one; yield figures of each."""
     update = {"gail": update_gail, "mgail": update_mgail}[learner.config.method]
+    config = learner.config
+    rates = (learner.policy_optimiser, config.policy_rate), (learner.critic_optimiser, CRITIC_RATE)
     if learner.update == 0:
-        for _ in range(learner.config.warm_up):  # the critic learns before the policy moves
+        for _ in range(config.warm_up):  # the critic learns before the policy moves
             with torch.no_grad():
                 steps = learner.drive(1.0)
             learner.learn_critic(steps)
-    while learner.update < learner.config.updates:
-        learner.set_rates()
+    while learner.update < config.updates:
+        for optimiser, rate in rates:
+            optimiser.param_groups[0]["lr"] = config.rate_factor(learner.update) * rate
         log = update(learner)
         learner.update += 1
         yield log
@@ -266,7 +272,7 @@ LEAST_SPREAD = 1e-6
 def update_mgail(learner: Learner) -> Log:
     """Drive with gradients, move the policy down them, train the critic."""
     config = learner.config
-    steps = learner.drive(config.credit)
+    steps = learner.drive(CREDIT)
     likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action)).mean()
     costs = Penalties(*(cost.mean() for cost in steps.costs))
     clone = learner.clone_loss()
@@ -316,22 +322,22 @@ def update_gail(learner: Learner) -> Log:
         reward = -total_cost(config, likeness, steps.costs).view(ticks, -1)
         seen = torch.cat((policy.normalise(steps.features), steps.noise), dim=1)
         expected = value(seen).view(ticks, -1)
-        gain = advantages(reward[:-1], expected, config.discount, config.gae)
+        gain = advantages(reward[:-1], expected, DISCOUNT, GAE_LAMBDA)
         target = (gain + expected[:-1]).flatten()
         kept = len(target)
         moments = conditional_action(policy, steps.features, steps.noise, config.colour)
         old = log_likelihood(*moments, steps.action)[:kept]
     gain = gain.flatten()
     gain = (gain - gain.mean()) / gain.std().clamp(min=LEAST_SPREAD)
-    for _ in range(config.ppo_epochs):
+    for _ in range(PPO_EPOCHS):
         for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
             moments = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
             ratio = torch.exp(log_likelihood(*moments, steps.action[rows]) - old[rows])
             clone = config.geometric_schedule(config.clone_weight, learner.update) * learner.clone_loss()
-            clipped = ratio.clamp(1.0 - config.clip, 1.0 + config.clip)
+            clipped = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
             surrogate = torch.minimum(ratio * gain[rows], clipped * gain[rows]).mean()
             descend(learner.policy_optimiser, clone - surrogate, policy)
-            error = (value(seen[rows])[:, 0] - target[rows]).square().mean()
+            error = (value(seen[rows]) - target[rows]).square().mean()
             descend(learner.value_optimiser, error)
     return {
         "reward": float(reward.mean()),

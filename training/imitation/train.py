@@ -28,9 +28,8 @@ from training.data.formats import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, scenes_of, split_by_clock
 from training.imitation.config import Config
 from training.imitation.evaluate import header_metrics
-from training.imitation.learner import Critic, Learner, clone_policy, make_seeded, run_updates
-from training.imitation.rollout import ACTION_HIGH, ACTION_LOW
-from training.imitation.traffic import Pairs, Recording, collect_pairs, stack_scenes
+from training.imitation.learner import Learner, clone_policy, make_critic, make_seeded, run_updates
+from training.imitation.traffic import ACTION_HIGH, ACTION_LOW, Pairs, Recording, collect_pairs, stack_scenes
 
 CPU = torch.device("cpu")
 CHECKPOINT_INTERVAL = 50
@@ -175,7 +174,7 @@ def make_learner(data: Data, config: Config, among: torch.Tensor | None = None, 
     recording = Recording(*(field.to(device) for field in data.recording))
     pairs = Pairs(*(field.to(device) for field in data.pairs))
     policy = clone_policy(pairs, config, generator)
-    critic = make_seeded(Critic, generator).to(device)
+    critic = make_seeded(make_critic, generator).to(device)
     among = torch.unique(pairs.scene) if among is None else among.to(device)
     return Learner(config, recording, among, pairs, policy, critic, generator)
 

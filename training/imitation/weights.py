@@ -30,7 +30,6 @@ from rich.console import Console
 from rich.progress import track
 from sklearn.covariance import graphical_lasso
 from sklearn.exceptions import ConvergenceWarning
-from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import RADIUS, WEIGHT_NAMES, WeightDistribution, head_weights
@@ -39,7 +38,7 @@ from rare_envs.startup import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
 from training.imitation.config import Config
-from training.imitation.learner import Critic, Learner, run_updates
+from training.imitation.learner import Learner, make_critic, run_updates
 from training.imitation.traffic import Pairs
 from training.imitation.train import (
     CHECKPOINT,
@@ -85,13 +84,6 @@ class Member(NamedTuple):
     within: FloatArray
 
 
-def member_config(base: Config, updates: int) -> Config:
-    """Return the base's settings with all schedules at their ends."""
-    names = ("horizon", "age", "drivers", "clone_weight")
-    last: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in names}  # fields by name
-    return replace(base, updates=updates, warm_up=0, **last)
-
-
 def train_member(
     data: Data, driver: LearnedDriver, base: Config, checkpoint: Path, ensemble: Ensemble, number: int
 ) -> Member:
@@ -100,20 +92,18 @@ def train_member(
     generator = torch.Generator().manual_seed(int(seed))
     scenes = torch.unique(data.pairs.scene)
     drawn = scenes[torch.randint(len(scenes), (len(scenes),), generator=generator)]
+    rows = torch.cat([(data.pairs.scene == scene).nonzero().flatten() for scene in drawn])
     policy = copy.deepcopy(driver.policy)
     policy.head.requires_grad_(True)
-    config, pairs = member_config(base, ensemble.updates), select_scenes(data.pairs, drawn)
-    learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
+    names = ("horizon", "age", "clone_weight")
+    ends: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in names}  # of schedules, fields by name
+    config = replace(base, updates=ensemble.updates, warm_up=0, **ends)
+    pairs = Pairs(*(column[rows] for column in data.pairs))
+    learner = Learner(config, data.recording, drawn, pairs, policy, make_critic(), generator)
     learner.inherit(checkpoint)
     visited = [head_weights(policy).detach() for _ in run_updates(learner)]
     late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
     return Member(late[-1], late.std(axis=0))
-
-
-def select_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
-    """Return the pairs of the scenes that were drawn, as often as they were drawn."""
-    rows = torch.cat([(pairs.scene == scene).nonzero().flatten() for scene in drawn])
-    return Pairs(*(column[rows] for column in pairs))
 
 
 def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> list[Member]:
@@ -140,26 +130,25 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
     return members
 
 
-def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
-    """Return how far members are from each other, move within their runs, and are on average from the base."""
-    weights = np.stack([member.weights for member in members])
-    between, within = weights.std(axis=0, ddof=1), np.stack([member.within for member in members]).mean(axis=0)
-    bias = np.abs(weights.mean(axis=0) - base)
-    found = dict[str, float]()
-    for name, values in (("between", between), ("within", within), ("bias", bias)):
-        found |= {f"{name}_median": float(np.median(values)), f"{name}_max": float(values.max())}
-    return {**found, "bias_over_spread": float(np.sqrt(np.square(bias).mean() / np.square(between).mean()))}
-
-
 def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = False) -> Path:
     """Write the driver of a finished training with a distribution of its weights to a `.safetensors` file."""
     members = train_members(folder, ensemble, progress)
     driver, provenance = read_driver(folder / DRIVER), read_provenance(folder / DRIVER)
-    fit = fit_weights(np.stack([member.weights for member in members]))
-    spread = measure_spread(members, head_weights(driver.policy).double().numpy())
+    weights = np.stack([member.weights for member in members])
+    fit = fit_weights(weights)
+    bias = np.abs(weights.mean(axis=0) - head_weights(driver.policy).double().numpy())
+    spreads = {
+        "between": weights.std(axis=0, ddof=1),  # how far members are from each other
+        "within": np.stack([member.within for member in members]).mean(axis=0),  # how far they move in their runs
+        "bias": bias,
+    }
     command = f"python -m training.imitation.weights RUN --members {ensemble.members} --updates {ensemble.updates}"
-    about = {"command": f"{command} --seed {ensemble.seed}", **spread, **fit.metadata}
-    return save_driver(replace(driver, weights=fit.distribution), replace(provenance, ensemble=about), out)
+    about: dict[str, Any] = {"command": f"{command} --seed {ensemble.seed}"}
+    for name, values in spreads.items():
+        about |= {f"{name}_median": float(np.median(values)), f"{name}_max": float(values.max())}
+    about["bias_over_spread"] = float(np.sqrt(np.square(bias).mean() / np.square(spreads["between"]).mean()))
+    whole = replace(provenance, ensemble={**about, **fit.metadata})
+    return save_driver(replace(driver, weights=fit.distribution), whole, out)
 
 
 _FAILURES = (FloatingPointError, ConvergenceWarning, RuntimeWarning, np.linalg.LinAlgError)
@@ -176,7 +165,6 @@ class WeightFit(NamedTuple):
 def fit_weights(
     members: FloatArray,
     *,
-    radius: float = RADIUS,
     penalties: Sequence[float] = PENALTIES,
     shrinkage: float = SHRINKAGE,
     folds: int = FOLDS,
@@ -185,21 +173,20 @@ def fit_weights(
     """Return the Gaussian N(mean, precision^-1) fitted to the last layers of K drivers, members (K, 404).
 
     Penalties are tried in descending order until one fails, on all members or without one of the folds, which hold out
-    consecutive members; the one with the greatest held-out log-likelihood is taken. A search may move each mean by the
-    radius. A ValueError says that a weight is not finite or the same in all, or that no penalty succeeds.
+    consecutive members; the one with the greatest held-out log-likelihood is taken. A search may move each mean by
+    `RADIUS`. A ValueError says that a weight is not finite or the same in all, or that no penalty succeeds.
     """
     members = np.asarray(members, dtype=np.float64)
-    everyone = _moments(members, shrinkage, names)
     held_out = np.array_split(np.arange(len(members)), folds)
-    without = [_moments(np.delete(members, fold, axis=0), shrinkage, names) for fold in held_out]
-
+    parts = [members, *(np.delete(members, fold, axis=0) for fold in held_out)]
+    correlations = [_correlate(part, shrinkage, names) for part in parts]
     tried: list[dict[str, float]] = []
     precisions: list[FloatArray] = []
     stopped = "no penalty left"
     for penalty in penalties:
         try:
-            precision = _lasso(everyone.correlation, penalty)
-            fitted = [part.distribution(_lasso(part.correlation, penalty), radius) for part in without]
+            precision, *others = (_lasso(correlation, penalty) for correlation in correlations)
+            fitted = [_distribution(*part) for part in zip(parts[1:], others, strict=True)]
         except _FAILURES as failure:
             stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
             break
@@ -217,33 +204,28 @@ def fit_weights(
     if not tried:
         raise ValueError(f"No distribution could be fitted: {stopped}. Start at a larger penalty or shrink more.")
     best = int(np.argmax([row["held_out_log_likelihood"] for row in tried]))
+    spread = members.std(axis=0, ddof=1)
     metadata = {
         "members": len(members),
         "folds": folds,
         "shrinkage": shrinkage,
-        **{name: tried[best][name] for name in ("penalty", "held_out_log_likelihood", "nonzeros", "condition")},
-        "spread_median": float(np.median(everyone.spread)),
-        "spread_max": float(everyone.spread.max()),
+        **tried[best],
+        "spread_median": float(np.median(spread)),
+        "spread_max": float(spread.max()),
         "stopped": stopped,
         "tried": tried,
     }
-    return WeightFit(everyone.distribution(precisions[best], radius), metadata)
+    return WeightFit(_distribution(members, precisions[best]), metadata)
 
 
-class _Moments(NamedTuple):
-    """Mean, standard deviation (404,) and correlation, shrunk towards the identity (404, 404), of members' weights."""
-
-    mean: FloatArray
-    spread: FloatArray
-    correlation: FloatArray
-
-    def distribution(self, precision: FloatArray, radius: float) -> WeightDistribution:
-        """Return the distribution with a precision of standardised weights."""
-        return WeightDistribution(self.mean, precision / np.outer(self.spread, self.spread), radius)
+def _distribution(members: FloatArray, precision: FloatArray) -> WeightDistribution:
+    """Return the distribution around the mean of members with a precision of standardised weights."""
+    spread = members.std(axis=0, ddof=1)
+    return WeightDistribution(members.mean(axis=0), precision / np.outer(spread, spread), RADIUS)
 
 
-def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Moments:
-    """Return the moments of members; a ValueError if a weight is not finite, or the same in all members."""
+def _correlate(members: FloatArray, shrinkage: float, names: Sequence[str]) -> FloatArray:
+    """Return the correlation of members' weights, shrunk towards the identity; refuse inert weights."""
     inert = ~np.isfinite(members).all(axis=0) | (members == members[0]).all(axis=0)
     if inert.any():
         some = ", ".join(names[j] for j in np.flatnonzero(inert)[:5])
@@ -252,11 +234,10 @@ def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Mo
             f"(the same in all, or not finite): {some}{', ...' if inert.sum() > 5 else ''}. "
             "Does a clamp keep gradients from them?"
         )
-    mean, spread = members.mean(axis=0), members.std(axis=0, ddof=1)
-    normal = (members - mean) / spread
-    correlation = (1.0 - shrinkage) * normal.T @ normal / (len(members) - 1)
+    normal = (members - members.mean(axis=0)) / members.std(axis=0, ddof=1)
+    correlation: FloatArray = (1.0 - shrinkage) * normal.T @ normal / (len(members) - 1)
     np.fill_diagonal(correlation, 1.0)
-    return _Moments(mean, spread, correlation)
+    return correlation
 
 
 def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:

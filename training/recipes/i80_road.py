@@ -88,12 +88,6 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArr
     return curve, origin + start[1] * right, angle - turn
 
 
-def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: ReferenceLine) -> list[float]:
-    """Return lane edges from left to right, their y [m]; that on the right, not surveyed, mirrors the line before."""
-    *edges, lane = (float(np.median(find_across(points, curve))) for points in (*reversed(lines), rightmost))
-    return [*edges, 2.0 * lane - edges[-1]]
-
-
 def main(
     folder: Annotated[Path, typer.Argument(help="Folder with lanes.csv and boundaries.csv.")],
     out: Annotated[Path, typer.Option(help="The file to write.")] = Path("rare_envs/data/i80.json"),
@@ -104,7 +98,9 @@ def main(
     curve, origin, angle = fit_reference_line(lanes)
     curve = ReferenceLine(KNOT_SPACING, tuple(round(k, 9) for k in curve.curvature))
     lanes, lines = ([to_frame(points, origin, angle) for points in group] for group in (lanes, lines))
-    road = Road(tuple(round(y, 3) for y in fit_lane_edges(lines, lanes[0], curve)), curve)
+    *edges, lane = (float(np.median(find_across(points, curve))) for points in (*reversed(lines), lanes[0]))
+    edges.append(2.0 * lane - edges[-1])  # that on the right was not surveyed: it mirrors the line before
+    road = Road(tuple(round(y, 3) for y in edges), curve)
     centres = tuple(road.centre(k) for k in range(SURVEY_LANES))
     for name, group, places in (("lines", lines, road.edges), ("lanes", lanes, centres)):
         each = [find_across(points, curve) - y for points, y in zip(reversed(group), places, strict=False)]

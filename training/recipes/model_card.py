@@ -97,7 +97,10 @@ def _table(corner: str, columns: Mapping[str, Mapping[str, Any]]) -> str:
     columns = {name: column for name, column in columns.items() if column}
     rows = dict.fromkeys(row for column in columns.values() for row in column)
     lines = [[corner, *columns], ["---"] * (len(columns) + 1)]
-    lines += [[row, *(_cell(column.get(row)) for column in columns.values())] for row in rows]
+    for row in rows:
+        values = ["" if column.get(row) is None else column[row] for column in columns.values()]
+        texts = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
+        lines.append([row, *(text.replace("|", "\\|") for text in texts)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -108,12 +111,6 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             yield from _flatten(value, f"{prefix}{name} ")
         elif not isinstance(value, list):
             yield prefix + name, value
-
-
-def _cell(value: Any) -> str:
-    """Return a value as the text of a cell."""
-    text = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-    return text.replace("|", "\\|")
 
 
 def main(folder: Annotated[Path, typer.Argument(help="Folder with the drivers.")]) -> None:

@@ -15,7 +15,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,6 @@ import typer
 from torch import Tensor, nn
 
 from agents import Provenance
-from agents.learned.driver import HEADING_TIME, OFFSET_TIME
 from agents.vision import (
     ACCELERATION_UNIT,
     LAG,
@@ -38,11 +37,10 @@ from agents.vision import (
     update_memory,
 )
 from rare_envs.control.actions import MAX_STEERING, to_physical
-from rare_envs.control.idm import IDM
+from rare_envs.control.idm import IDM, TAU_HEADING, TAU_LATERAL
 from rare_envs.sensors.camera import Weather
 from rare_envs.sensors.pictures import take_picture
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.world import World
 from rare_envs.startup import use_one_thread
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.command_line import RunFolderOption, run_command
@@ -89,8 +87,8 @@ def expert_outputs(episode: Episode) -> Tensor:
     state, road = episode.state, episode.road
     speed, heading = state.speed[:, 0].clamp(min=MIN_STEERING_SPEED), state.heading[:, 0]
     offset = state.y[:, 0] - road.centre_of(state.y[:, 0])
-    wanted = torch.asin((-offset / (OFFSET_TIME * speed)).clamp(-0.3, 0.3))
-    turn = (wanted - heading) / HEADING_TIME + speed * road.curvature(state.x[:, 0])
+    wanted = torch.asin((-offset / (TAU_LATERAL * speed)).clamp(-0.3, 0.3))
+    turn = (wanted - heading) / TAU_HEADING + speed * road.curvature(state.x[:, 0])
     slip = torch.atan(0.5 * torch.tan(torch.tensor(MAX_STEERING)))  # of the bicycle model at full steering
     limit = speed * torch.sin(slip) / (0.5 * VEHICLE_LENGTH)
     acceleration = VISION_EXPERT.acceleration(state.speed[:, 0], episode.lead)
@@ -125,53 +123,47 @@ def concatenate(parts: list[LabelledPictures]) -> LabelledPictures:
     return LabelledPictures(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
 
 
-def drive_situations(
-    network: PilotNet | None, share: float, drives: int, rows: int, ticks: int, rng: np.random.Generator, **how: Any
-) -> Iterator[LabelledPictures]:
-    """Yield the moments of situations, taken in turn; `network`, `share` and `how` as in `drive_and_label`."""
-    situations = make_situations()
-    for number in range(drives):
-        start = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
-        yield from drive_and_label(*start, network, share, ticks, rng, **how)
-
-
 @torch.inference_mode()
-def drive_and_label(
-    world: World,
-    episode: Episode,
+def drive_situations(
     network: PilotNet | None,
     share: float,
+    drives: int,
+    rows: int,
     ticks: int,
     rng: np.random.Generator,
     *,
     recorded_share: float,
     noise: float = 0.0,
 ) -> Iterator[LabelledPictures]:
-    """Drive on from a moment, and yield pictures with the outputs of the expert, until egos collide.
+    """Drive in situations, taken in turn, and yield pictures with the outputs of the expert, until egos collide.
 
     The network decides at a share of the ticks, the expert at the others; with None the expert drives alone. A share of
     the ticks is recorded. Actions have a factor of a noise of 0.5 m/s^2 and 0.05 rad/s for about
     half a second, so that places off the expert's path are seen.
     """
-    state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
-    for _ in range(ticks):
-        speed, expert = episode.state.speed[:, 0], expert_outputs(episode)
-        recorded = ~episode.collided & bool(rng.random() < recorded_share)
-        swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
-        output = expert + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
-        if network is None:  # the expert needs no pictures: only recorded ones are taken
+    situations = make_situations()
+    for number in range(drives):
+        situation = situations[number % len(situations)]
+        world, episode = start_situation(situation, rows, ticks * VisionEgo.dt, rng)
+        state, swing, before = None, np.zeros((rows, 2)), deque([episode], LAG)
+        for _ in range(ticks):
+            speed, expert = episode.state.speed[:, 0], expert_outputs(episode)
+            recorded = ~episode.collided & bool(rng.random() < recorded_share)
+            swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
+            output = expert + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
+            if network is None:  # the expert needs no pictures: only recorded ones are taken
+                if bool(recorded.any()):
+                    seen = _take_pictures(episode, recorded), luma(_take_pictures(before[0], recorded)), speed[recorded]
+            else:
+                picture = _take_pictures(episode, torch.ones_like(recorded))
+                past, state = update_memory(picture, state)
+                decides = torch.from_numpy(rng.random(rows) < share)[:, None]
+                output = torch.where(decides, network(picture, torch.from_numpy(past), speed), output)
+                seen = picture[recorded], torch.from_numpy(past)[recorded.numpy()], speed[recorded]
             if bool(recorded.any()):
-                seen = _take_pictures(episode, recorded), luma(_take_pictures(before[0], recorded)), speed[recorded]
-        else:
-            picture = _take_pictures(episode, torch.ones_like(recorded))
-            past, state = update_memory(picture, state)
-            decides = torch.from_numpy(rng.random(len(speed)) < share)[:, None]
-            output = torch.where(decides, network(picture, torch.from_numpy(past), speed), output)
-            seen = picture[recorded], torch.from_numpy(past)[recorded.numpy()], speed[recorded]
-        if bool(recorded.any()):
-            yield LabelledPictures(*seen, expert[recorded], auxiliary_targets(episode)[recorded])
-        before.append(episode)
-        episode = world.step(episode, to_physical(to_actions(output, speed), len(speed), episode.collided))
+                yield LabelledPictures(*seen, expert[recorded], auxiliary_targets(episode)[recorded])
+            before.append(episode)
+            episode = world.step(episode, to_physical(to_actions(output, speed), rows, episode.collided))
 
 
 def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
@@ -181,12 +173,6 @@ def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
     weather = Weather(*(field[rows] for field in context.weather))
     context = context._replace(weather=weather, tick=context.tick[rows])
     return take_picture(State(*(field[rows] for field in state)), episode.road, context)
-
-
-def draw_batch(data: LabelledPictures, size: int, rng: np.random.Generator) -> LabelledPictures:
-    """Return some of the moments, left and right exchanged in half of them."""
-    some = torch.from_numpy(rng.integers(0, len(data.speed), size))
-    return mirror(LabelledPictures(*(field[some] for field in data)), torch.from_numpy(rng.random(size) < 0.5))
 
 
 def mirror(pictures: LabelledPictures, rows: Tensor) -> LabelledPictures:
@@ -215,7 +201,10 @@ def train_vision(plan: VisionPlan) -> PilotNet:
         recorded += drive_situations(network if later else None, share, drives, plan.rows, ticks, rng, **how)
         data, left = concatenate(recorded), plan.visits[later]
         while left > 0:
-            some = draw_batch(data, min(plan.batch, left), rng)
+            size = min(plan.batch, left)
+            drawn = torch.from_numpy(rng.integers(0, len(data.speed), size))
+            turned = torch.from_numpy(rng.random(size) < 0.5)  # left and right are exchanged in half of them
+            some = mirror(LabelledPictures(*(field[drawn] for field in data)), turned)
             hidden = network.hidden(some.picture, some.earlier, some.speed)
             error = nn.functional.smooth_l1_loss(network.out(hidden), some.expert, beta=0.5)
             truth = nn.functional.smooth_l1_loss(probe(hidden), some.truth)

@@ -171,7 +171,7 @@ def test_settings_are_positive_numbers():
     for kind in (CollisionAvoidance, LaneChanges):
         name = fields(kind)[3].name
         for value in (0.0, -1.0, math.nan, math.inf, True, "2"):
-            with pytest.raises(ValueError, match=f"Expected {name} of the .* above 0"):
+            with pytest.raises(ValueError, match=f"Expected {name} of the .* to be a number above 0, finite"):
                 kind(**{name: value})
     for coefficients in ((1.0, 2.0), (0.0, 0.0, 0.0, 0.0, math.nan)):
         with pytest.raises(ValueError, match="Expected 5 finite coefficients of the hazard"):

@@ -117,7 +117,7 @@ def test_distances_along_and_across_are_kept(radius, angle):
     there = {"radius": radius, "angle": angle, "shift": (300.0, 90.0)}
     u, w = bend(x, y, **there)
     heading = np.array([np.subtract(*bend(np.array([600.0, 590.0]), 0.0, **there)[k]) for k in (0, 1)])
-    along, across = fit_road_axis(u, w, lane, heading).project(u, w)
+    along, across = fit_road_axis(u, w, lane, heading)(u, w)
     # the axis is parallel to the road at some distance, of which radians of the turn are lost along it
     offset = np.median(across - y)
     assert abs(offset) < 20.0
@@ -128,9 +128,7 @@ def test_distances_along_and_across_are_kept(radius, angle):
 
 def test_points_beyond_the_ends_lie_on_the_tangents():
     x, y, lane = tracks(np.random.default_rng(2), noise=0.0)
-    along, across = fit_road_axis(x, y, lane, np.array([1.0, 0.0])).project(
-        np.array([0.0, 1200.0, 1250.0]), np.full(3, 5.4)
-    )
+    along, across = fit_road_axis(x, y, lane, np.array([1.0, 0.0]))(np.array([0.0, 1200.0, 1250.0]), np.full(3, 5.4))
     assert np.diff(along) == pytest.approx([1200.0, 50.0], abs=0.01)
     assert np.ptp(across) < 0.01
 

@@ -11,7 +11,7 @@ from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.cut_in import CUTTER_IDM, CutterModel
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from tests.training.shared_data import DATA, needs_data
-from training.data.events import ANSWERS, cut_in_events, measure_answer
+from training.data.events import ANSWERS, cut_in_events, measure_answers
 from training.data.table import synthetic_traffic
 from training.fit.checks import check_answers, simulate_answers
 from training.recipes.bases import SHIPPED_BASES
@@ -66,10 +66,11 @@ def test_an_answer_is_the_change_of_speed_over_two_seconds():
     """Braking by 2 m/s^2 from 1 s on, by 20 m/s to 14: at 1 s a mean of -2 and a hardest braking near 2 m/s^2."""
     t = 0.1 * np.arange(80)
     speed = 20.0 - 2.0 * np.clip(t - 1.0, 0.0, 3.0)
-    mean, braking = measure_answer(np.append(0.0, np.cumsum(0.1 * speed))[:-1], speed, 10)
+    position, start = np.append(0.0, np.cumsum(0.1 * speed))[:-1], np.zeros(1, int)
+    ((mean, braking),) = measure_answers(start, position, speed, start + 10)
     assert mean == pytest.approx(-2.0)
     assert braking == pytest.approx(2.0, abs=0.2)
-    assert np.isnan(measure_answer(t, speed, 65)).all()  # the track ends before
+    assert np.isnan(measure_answers(start, t, speed, start + 65)).all()  # the track ends before
 
 
 def test_answers_of_cut_ins_are_those_of_the_table():

@@ -11,7 +11,6 @@ from agents.learned.networks import Policy
 from tests.training.imitation.synthetic_scenes import SMALL, at_start, generator, plain_policy, scenes, tiny
 from training.imitation.config import Config
 from training.imitation.learner import (
-    Critic,
     advantages,
     clone_policy,
     conditional_action,
@@ -20,8 +19,17 @@ from training.imitation.learner import (
     run_updates,
     scaling_of,
 )
-from training.imitation.rollout import ScenePool, compute_penalties, normalise_action, roll_out
-from training.imitation.traffic import Pairs, Recording, Traffic, collect_pairs, stack_scenes
+from training.imitation.traffic import (
+    Pairs,
+    Recording,
+    ScenePool,
+    Traffic,
+    collect_pairs,
+    compute_penalties,
+    normalise_action,
+    roll_out,
+    stack_scenes,
+)
 from training.imitation.train import make_learner, train_learner
 
 
@@ -42,7 +50,7 @@ def test_a_linear_driver_is_cloned_with_its_noise():
 
 def test_settings_are_checked():
     wrong = {"method": "sac", "updates": 0, "epochs": -1, "pools": 0, "horizon": (15, 0), "clone_weight": (0.1, 0.0)}
-    wrong |= {"policy_rate": float("nan"), "edge_weight": -1.0, "discount": 1.1, "anneal": 0.0, "last_rate": 2.0}
+    wrong |= {"policy_rate": float("nan"), "edge_weight": -1.0}
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"Expected {name}"):
             Config(**{name: value})
@@ -113,11 +121,10 @@ def test_the_gradient_of_a_rollout_is_that_of_finite_differences(recording):
 
 def test_the_critic_s_loss_by_hand():
     """A linear critic w.x: the penalty is |w|^2 wherever it is taken, and the rest is the logistic loss."""
-    critic = Critic()
     w = torch.randn(53, generator=generator()) * 0.1
-    critic.layers = torch.nn.Sequential(torch.nn.Linear(53, 1, bias=False))
+    critic = torch.nn.Sequential(torch.nn.Linear(53, 1, bias=False), torch.nn.Flatten(0))
     with torch.no_grad():
-        critic.layers[0].weight.copy_(w)
+        critic[0].weight.copy_(w)
     recorded, made = torch.randn(7, 53, generator=generator(1)), torch.randn(7, 53, generator=generator(2))
     loss = critic_loss(critic, recorded, made, 0.5, generator())
     expected = np.log1p(np.exp(-(recorded @ w).numpy())).mean() + np.log1p(np.exp((made @ w).numpy())).mean()

@@ -8,8 +8,7 @@ import torch
 
 from tests.training.imitation.synthetic_scenes import at_start, generator, scene, tiny
 from training.imitation.evaluate import binned_quantities, jensen_shannon, measure, recorded_behaviour
-from training.imitation.rollout import draw_pool
-from training.imitation.traffic import stack_scenes, start_replay, step_replay
+from training.imitation.traffic import draw_pool, stack_scenes, start_replay, step_replay
 
 
 def test_shorter_scenes_are_padded_with_absent_vehicles():
