@@ -191,24 +191,35 @@ Plan = Callable[[Chains, int, int, np.random.Generator], NextLevel | Status]
 the simulations made for the levels after level 0."""
 
 
+class Descent(NamedTuple):
+    """The levels of a descent, level 0 first, their records, and how it ended."""
+
+    levels: list[Growth]
+    trace: list[Level]
+    status: Status
+
+
 def descend(
     inputs: Inputs,
     first: Chains,
     kernel: Kernel,
     plan_next: Plan,
-    report: Callable[[Growth, NextLevel | Status], None],
+    gamma: float,
     rng: np.random.Generator,
-) -> Generator[FloatArray, FloatArray, Status]:
-    """Go from level to level until the plan ends the descent or it is interrupted; every level is reported once."""
-    growth = Growth(first, kernel, False, first.u[:0, 0], first.f[:0, 0])
-    depth, n_sim = 0, 0
+    on_level: Callable[[Level], None] = lambda level: None,
+) -> Generator[FloatArray, FloatArray, Descent]:
+    """Go from level to level until the plan ends the descent or it is interrupted; the last one counts f <= gamma."""
+    levels, trace = [Growth(first, kernel, False, first.u[:0, 0], first.f[:0, 0])], list[Level]()
     while True:
-        planned = Status.STOPPED if growth.interrupted else plan_next(growth.chains, depth, n_sim, rng)
-        report(growth, planned)
+        last, n_sim = levels[-1], sum(level.chains.n_new for level in levels[1:])
+        planned = Status.STOPPED if last.interrupted else plan_next(last.chains, len(trace), n_sim, rng)
+        threshold = planned.threshold if isinstance(planned, NextLevel) else gamma
+        trace.append(level_record(last.chains, threshold, trace))
+        on_level(trace[-1])
         if isinstance(planned, Status):
-            return planned
-        growth = yield from grow_chains(inputs, planned.seeds, planned.threshold, planned.lengths, growth.kernel, rng)
-        depth, n_sim = depth + 1, n_sim + growth.chains.n_new
+            return Descent(levels, trace, planned)
+        steps = grow_chains(inputs, planned.seeds, planned.threshold, planned.lengths, last.kernel, rng)
+        levels.append((yield from steps))
 
 
 def level_record(chains: Chains, threshold: float, before: Sequence[Level]) -> Level:

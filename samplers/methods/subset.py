@@ -2,39 +2,20 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from functools import partial
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
 from samplers.importance import COARSE_ESS
-from samplers.mcmc import (
-    Chains,
-    Growth,
-    Kernel,
-    NextLevel,
-    RootedPoints,
-    descend,
-    independent_chains,
-    judge_levels,
-    level_record,
-)
+from samplers.mcmc import Chains, Kernel, NextLevel, RootedPoints, descend, independent_chains, judge_levels
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.problem import Inputs, check_settings
 from samplers.sample import Layer, Level, Sample, Status, clopper_pearson, next_level
 
-LONGEST_CHAIN = 50
-"""More steps than this from a handful of seeds cost calls of f and add little."""
-FEWEST_SEEDS = 10
-"""A level is not made smaller for the sake of the budget than this many seeds allow."""
 FEWEST_LEVELS = 2
 """Levels to plan the rest of a budget for at least."""
-LEVEL_SHARE = 0.9
-"""Share of a level that is simulated; its seeds, p0 = 0.1 of it, are not simulated again."""
-CHAIN_POINTS = 30.0
-"""Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
-USUAL_LEVELS = 4
-"""Levels that shall fit into a small budget: down to p = p0^4, 1e-4."""
 
 
 class SubsetMethod(Method, Protocol):
@@ -51,47 +32,34 @@ class SubsetMethod(Method, Protocol):
         """Go from level to level until the share of failures among its points is p0 or more."""
         u, f = (np.empty((0, inputs.dim)), np.empty(0)) if known is None else (known.u, known.f)
         budget, gamma = goal.budget + len(f), goal.gamma
-        fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
-        n = min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
-        levels, trace = list[Chains](), list[Level]()
-
-        def record(growth: Growth, planned: NextLevel | Status) -> None:
-            threshold = planned.threshold if isinstance(planned, NextLevel) else gamma
-            levels.append(growth.chains)
-            trace.append(level_record(growth.chains, threshold, trace))
-            goal.on_level(trace[-1])
-
+        fitting = int(budget / (1 + 3 * (1 - self.p0)))  # four levels, to p0^4; seeds are not simulated again
+        n = min(self.n, max(math.ceil(10 / self.p0), fitting))  # at least ten seeds
         new = rng.standard_normal((max(min(n, budget), len(f)) - len(f), inputs.dim))
         if len(new):
             outcomes = yield inputs.base.from_standard_normal(new)
             u, f = np.concatenate([u, new]), np.concatenate([f, outcomes])
         first = independent_chains(u, f)._replace(n_new=len(new))
-        planner = SubsetPlanner(n, self.p0, self.max_levels, gamma, goal.budget - len(new))
-        status = yield from descend(inputs, first, kernel, planner.plan_next, record, rng)
-        outcome = summarise(inputs, levels, goal, trace, status)
+        plan = partial(self._plan_next, n, gamma, goal.budget - len(new))
+        found = yield from descend(inputs, first, kernel, plan, gamma, rng, goal.on_level)
+        outcome = summarise(inputs, [level.chains for level in found.levels], goal, found.trace, found.status)
         if budget < n:
             about = f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."
             return outcome.remark_first(about)
         few = f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."
         return outcome.remark_first(few) if n < self.n / 2 else outcome
 
+    def _plan_next(
+        self, n: int, gamma: float, budget: int, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator
+    ) -> NextLevel | Status:
+        """Return the next level, of n points, or how the run ends: converged once p0 of the present points fail.
 
-class SubsetPlanner(NamedTuple):
-    """Levels of n points whose seeds are all points below the threshold, as the estimate of the error needs them."""
-
-    n: int  # points per level
-    p0: float  # wanted conditional probability of each level
-    max_levels: int  # levels after which the method gives up, level 0 included
-    gamma: float
-    budget: int  # simulations for the levels after level 0
-
-    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
-        """Return the next level, or how the run ends: converged once p0 of the present points fail."""
-        left = self.budget - n_sim
-        threshold = next_level(chains.f[chains.used], self.p0, self.gamma)
-        if threshold == self.gamma:
+        Its seeds are all points below the threshold, as the estimate of the error needs them.
+        """
+        left = budget - n_sim
+        threshold = next_level(chains.f[chains.used], self.p0, gamma)
+        if threshold == gamma:
             return Status.CONVERGED
-        if left == 0 and chains.f.size < self.n:
+        if left == 0 and chains.f.size < n:
             return Status.BUDGET  # too few points of level 0 to speak of ties
         if threshold is None or depth + 1 >= self.max_levels:
             return Status.STALLED
@@ -99,14 +67,10 @@ class SubsetPlanner(NamedTuple):
         n_seeds = len(seeds.f)
         if left < n_seeds:
             return Status.BUDGET  # not one step for every chain
-        longest = max(LONGEST_CHAIN, math.ceil(1 / self.p0))
-        total = max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
+        longest = max(50, math.ceil(1 / self.p0))  # more steps from a handful of seeds add little
+        total = max(min(n, n_seeds + left, n_seeds * longest), n_seeds)
         lengths = total // n_seeds + (rng.permutation(n_seeds) < total % n_seeds)  # equal, or differing by 1 at random
         return NextLevel(threshold, seeds, np.asarray(lengths, dtype=np.int64))
-
-
-ACCEPTANCE_RANGE = (0.15, 0.85)
-"""Acceptance without a warning: below it chains hardly move, above it their steps are short."""
 
 
 def summarise(inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Level], status: Status) -> Outcome:
@@ -119,13 +83,18 @@ def summarise(inputs: Inputs, levels: list[Chains], goal: Goal, trace: list[Leve
     of_base = len(levels[0].where(levels[0].f <= goal.gamma).f)
     most = clopper_pearson(of_base, trace[0].n_points, goal.confidence)[1]
     about = _describe_end(len(trace) - 1, status, len(hits))
+    chains = [
+        f"Acceptance {level.acceptance:.2f} at level {k} is outside [0.15, 0.85]: the chains explore badly."
+        for k, level in enumerate(trace)
+        if level.acceptance is not None and not 0.15 <= level.acceptance <= 0.85  # they hardly move, or by short steps
+    ]
     enough = status is Status.BUDGET and len(hits) >= COARSE_ESS  # the interval says what fewer levels leave open
     return Outcome(
         p=p,
         interval=(low, max(p, min(high, most))),
         cov=cov,
         status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
-        warnings=(*(() if enough else about), *_chain_warnings(trace)),
+        warnings=(*(() if enough else about), *chains),
         remarks=tuple(about) if enough else (),
         trace=tuple(trace),
         no_outcome_share=no_outcome_share(hits),
@@ -168,16 +137,6 @@ def _describe_end(depth: int, status: Status, hits: int) -> list[str]:
     if hits == 0:
         found.append("No failure was seen: p = 0 with a one-sided interval.")
     return found
-
-
-def _chain_warnings(trace: list[Level]) -> list[str]:
-    """Return which levels have chains that mix badly."""
-    low, high = ACCEPTANCE_RANGE
-    return [
-        f"Acceptance {level.acceptance:.2f} at level {k} is outside [{low}, {high}]: the chains explore badly."
-        for k, level in enumerate(trace)
-        if level.acceptance is not None and not low <= level.acceptance <= high
-    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -328,9 +287,9 @@ def spend_on_subset_simulation(
 ) -> Steps:
     """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for."""
     levels, n_known = max(levels, FEWEST_LEVELS), 0 if known is None else len(known.f)
-    n = int((budget + n_known) / (1 + LEVEL_SHARE * (levels + 0.5)))
-    if goal.target_cov is not None:
-        n = min(n, math.ceil(CHAIN_POINTS * (levels + 1) / goal.target_cov**2))
+    n = int((budget + n_known) / (1 + 0.9 * (levels + 0.5)))  # seeds, a tenth, are not simulated again
+    if goal.target_cov is not None:  # a point is worth 1 / 30: p0 / (1 - p0), and correlation along the chains
+        n = min(n, math.ceil(30 * (levels + 1) / goal.target_cov**2))
     n = max(n, 10)
     known = known and known.select(np.arange(min(n, n_known)))
     outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)

@@ -24,26 +24,8 @@ from samplers.components import HalfSpaceIntersection
 from samplers.methods.two_stage.settings import PLANES
 from samplers.problem import FloatArray
 
-LARGEST_OUTCOME = 1e300
-"""An f of -inf arrives as the lowest number, about -1.8e308."""
-TRIMMED_SHARE = 0.02
-"""Share of the outcomes left out at either end."""
 MIN_POINTS = 5
 """Points that a regression needs beside one for each coefficient."""
-RIDGE = 1e-3
-"""Penalty of slopes: points may lie in a plane."""
-STEPS = 10
-"""Regressions of each piece: by then hardly a point changes its piece."""
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
-ROUNDING = 1e-9
-"""Deviation up to which a point agrees all the same; y has a standard deviation of 1."""
-SLACK = 0.02
-"""By how much a half-space begins before the edge, in standard deviations of N(0, I)."""
-MIN_TURN = 0.1
-"""Sine of the least angle between a plane and the span of those before it: two at less are one."""
-LEAST_SQUARE = 1e-20
-"""Mean square of residuals under which a fit is exact."""
 NO_PIECE = -1
 """In place of the number of a piece."""
 
@@ -179,18 +161,19 @@ def _beyond(fit: Pieces, failures: FloatArray) -> HalfSpaceIntersection | None:
     """Return N(0, I) beyond the planes at which pieces are 0, the furthest first; None if that is nearly N(0, I).
 
     A plane begins `crossing_errors` standard errors before, or where the failures (m, d) do if the pieces do not locate
-    that, and by `slack` before this. Planes that hold nearly all draws, and those that are nearly parallel to further
+    that, and 0.02 before this. Planes that hold nearly all draws, and those that are nearly parallel to further
     ones, are left out.
     """
     axes, steepness = fit.axes, np.linalg.norm(fit.slopes, axis=1)
     starts = -(fit.intercepts + PLANES.crossing_errors * fit.errors) / np.where(steepness > 0, steepness, 1.0)
     if fit.beside or not fit.locate_boundary():
         starts = np.array([failure_edge(failures @ axis) for axis in axes])
-    starts = np.where(steepness > 0, starts - SLACK, -np.inf)
+    starts = np.where(steepness > 0, starts - 0.02, -np.inf)
     kept: list[int] = []
     for k in np.argsort(-starts):
         q = np.linalg.qr(axes[kept].T)[0]
-        if starts[k] > PLANES.min_start and np.linalg.norm(axes[k] - q @ (q.T @ axes[k])) > MIN_TURN:
+        turn = np.linalg.norm(axes[k] - q @ (q.T @ axes[k]))  # sine of its least angle to the span of those before it
+        if starts[k] > PLANES.min_start and turn > 0.1:
             kept.append(int(k))
     if not kept or (len(kept) == 1 and starts[kept[0]] < PLANES.min_distance):
         return None
@@ -199,11 +182,11 @@ def _beyond(fit: Pieces, failures: FloatArray) -> HalfSpaceIntersection | None:
 
 def _find_usual(f: FloatArray) -> NDArray[np.bool_]:
     """Return which outcomes (n,) are finite and not among the highest or lowest ones: f may be capped or wild there."""
-    finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
+    finite = np.isfinite(f) & (np.abs(f) < 1e300)  # an f of -inf arrives as the lowest number, about -1.8e308
     ordered = np.sort(f[finite])
     if len(ordered) == 0:
         return finite
-    left_out = int(TRIMMED_SHARE * len(ordered))
+    left_out = int(0.02 * len(ordered))
     return np.asarray(finite & (f >= ordered[left_out]) & (f <= ordered[-1 - left_out]))
 
 
@@ -253,7 +236,7 @@ def _fit_corner(sample: Sample) -> Pieces | None:
 def _refine(sample: Sample, own: NDArray[np.int64], sigmas: float) -> Regression | None:
     """Return regressions, each on the points (n,) at which it is the least piece, repeated until none moves."""
     found = None
-    for _ in range(STEPS):
+    for _ in range(10):  # by then hardly a point changes its piece
         regression = _regress(sample, own)
         if regression is None:
             return None
@@ -279,8 +262,9 @@ def _assign(sample: Sample, coefficients: FloatArray, sigmas: float) -> NDArray[
     for k in range(len(limit)):
         deviations = deviation[own == k]
         if len(deviations):
-            limit[k] = sigmas * MAD_TO_SIGMA * np.partition(deviations, len(deviations) // 2)[len(deviations) // 2]
-    return np.where(deviation <= limit[own] + ROUNDING, own, NO_PIECE)
+            median = np.partition(deviations, len(deviations) // 2)[len(deviations) // 2]
+            limit[k] = sigmas * 1.4826 * median  # the standard deviation of a normal distribution is 1.4826 of these
+    return np.where(deviation <= limit[own] + 1e-9, own, NO_PIECE)
 
 
 def _regress(sample: Sample, own: NDArray[np.int64]) -> Regression | None:
@@ -291,7 +275,8 @@ def _regress(sample: Sample, own: NDArray[np.int64]) -> Regression | None:
     if not enough.any():
         return None
     x = np.where(members[enough, :, None], sample.x, 0.0).transpose(0, 2, 1)
-    normal = x @ sample.x + RIDGE * np.diag(np.arange(width) < width - 1)  # the intercept has no penalty
+    # points may lie in a plane, so slopes have a penalty, the intercept has none
+    normal = x @ sample.x + 1e-3 * np.diag(np.arange(width) < width - 1)
     return Regression(np.asarray(np.linalg.solve(normal, (x @ sample.y)[:, :, None])[:, :, 0], np.float64), own)
 
 
@@ -319,7 +304,7 @@ def _prune(sample: Sample, coefficients: FloatArray) -> FloatArray:
 
     def score(kept: NDArray[np.int64]) -> float:
         square = float(((sample.y - predicted[:, kept].min(axis=1)) ** 2).mean())
-        return float(n * math.log(max(square, LEAST_SQUARE)) + len(kept) * cost)
+        return float(n * math.log(max(square, 1e-20)) + len(kept) * cost)  # the fit is exact, then
 
     kept = np.arange(len(coefficients))
     while len(kept) > 1:

@@ -29,23 +29,14 @@ References:
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
-from samplers.mcmc import (
-    Chains,
-    Growth,
-    Kernel,
-    NextLevel,
-    descend,
-    independent_chains,
-    judge_levels,
-    level_record,
-)
+from samplers.mcmc import Chains, Kernel, NextLevel, descend, independent_chains, judge_levels
 from samplers.method import Goal, Interrupted
 from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
 from samplers.methods.two_stage.regions import (
@@ -59,14 +50,10 @@ from samplers.methods.two_stage.regions import (
 )
 from samplers.methods.two_stage.settings import BUDGET, EXPLORATION, HIGH_DIM, LINES, SLOPES
 from samplers.problem import FloatArray
-from samplers.sample import Level, Status, next_level
+from samplers.sample import Status, next_level
 
 LEAST_SLOPES = 4
 """Gradients that two directions can be told from many with."""
-LINE_STARTS = 4
-"""Lines of each region from which chains start."""
-CHAIN_COST = 25
-"""Simulations that a chain needs at most before it is sorted: bisection, its steps, points half way."""
 _A = TypeVar("_A")
 _B = TypeVar("_B")
 _T = TypeVar("_T")
@@ -121,32 +108,26 @@ class _Activity(Generic[_T]):
             self.points, self.result = None, end.value
 
 
-@dataclass(frozen=True)
-class ExplorationPlanner:
-    """Levels whose seeds are a random part of the points below the threshold, in chains of equal length."""
+def _plan_level(
+    gamma: float, n: int, budget: int, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator
+) -> NextLevel | Status:
+    """Return the next level, of n points or a few more, or how the descent ends: converged once a tenth of them fail.
 
-    gamma: float
-    """Threshold of failure."""
-    n: int
-    """Points per level, a few more where the chains do not divide them."""
-    budget: int
-    """Simulations for all levels."""
-
-    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
-        """Return the next level, or how the descent ends: converged once `level_fraction` of the points fail."""
-        points = chains.by_step()
-        if depth == 0 and np.count_nonzero(points.f <= self.gamma) >= EXPLORATION.common_failures:
-            return Status.CONVERGED
-        threshold = next_level(points.f, EXPLORATION.level_fraction, self.gamma)
-        if threshold == self.gamma:
-            return Status.CONVERGED
-        if threshold is None or depth >= 30:  # the budget ends the descent first unless f ties
-            return Status.STALLED
-        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // 3]  # chains take two steps or more
-        steps = max(1, math.ceil(self.n / len(seeds)) - 1)
-        if n_sim + steps * len(seeds) > self.budget:
-            return Status.BUDGET
-        return NextLevel(threshold, points.select(seeds), np.full(len(seeds), steps + 1))
+    Its seeds are a random part of the points below the threshold, its chains of equal length.
+    """
+    points = chains.by_step()
+    if depth == 0 and np.count_nonzero(points.f <= gamma) >= EXPLORATION.common_failures:
+        return Status.CONVERGED
+    threshold = next_level(points.f, EXPLORATION.level_fraction, gamma)
+    if threshold == gamma:
+        return Status.CONVERGED
+    if threshold is None or depth >= 30:  # the budget ends the descent first unless f ties
+        return Status.STALLED
+    seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: n // 3]  # chains take two steps or more
+    steps = max(1, math.ceil(n / len(seeds)) - 1)
+    if n_sim + steps * len(seeds) > budget:
+        return Status.BUDGET
+    return NextLevel(threshold, points.select(seeds), np.full(len(seeds), steps + 1))
 
 
 def descend_levels(
@@ -159,16 +140,9 @@ def descend_levels(
     All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
     kernel = Kernel("conditional", 0.6, EXPLORATION.level_acceptance)  # begins as `AdaptiveSubsetSimulation` does
-    gamma = goal.gamma
-    planner = ExplorationPlanner(gamma, n, most - simulator.n_sim)
-    levels, thresholds = list[Growth](), list[float]()
-
-    def record(growth: Growth, planned: NextLevel | Status) -> None:
-        levels.append(growth)
-        thresholds.append(planned.threshold if isinstance(planned, NextLevel) else gamma)
-
+    gamma, plan = goal.gamma, partial(_plan_level, goal.gamma, n, most - simulator.n_sim)
     first = independent_chains(u, f)
-    status = yield from descend(simulator.inputs, first, kernel, planner.plan_next, record, rng)
+    levels, trace, status = yield from descend(simulator.inputs, first, kernel, plan, gamma, rng)
     outcomes = np.concatenate([level.f_candidates for level in levels])
     simulator.n_sim += len(outcomes)
     if status is Status.STOPPED:
@@ -181,16 +155,8 @@ def descend_levels(
         outcomes,
         len(levels) - 1,
         np.unique(failing.roots),
-        _upper_end([level.chains for level in levels], thresholds, goal),
+        judge_levels(last, goal, trace)[1][1],
     )
-
-
-def _upper_end(levels: list[Chains], thresholds: list[float], goal: Goal) -> float:
-    """Return the upper limit of p by subset simulation."""
-    trace = list[Level]()
-    for chains, threshold in zip(levels, thresholds, strict=True):
-        trace.append(level_record(chains, threshold, trace))
-    return judge_levels(levels[-1], goal, trace)[1][1]
 
 
 def walk_lines(
@@ -323,7 +289,7 @@ def find_regions(
     density = mixture_log_ratio(log_ratios(first.components[1:], wide_u), first.counts[1:].astype(np.float64))
     roots = len(np.union1d(descent.roots, line_roots))
     discovery = Discovery(count_lineages(roots, -density), ceiling=descent.ceiling)
-    most = max(2, (sizes.limit - simulator.n_sim) // CHAIN_COST)
+    most = max(2, (sizes.limit - simulator.n_sim) // 25)  # a chain takes as many: bisection, steps, points half way
     nearest, n_far = np.argsort((wide_u**2).sum(axis=1), kind="stable"), min(sizes.starts, most)
     others = rng.permutation(nearest[n_far // 2 :])[: n_far - n_far // 2]  # no region that was met is left out by rule
     chosen = wide_u[np.append(nearest[: n_far // 2], others)]
@@ -335,7 +301,7 @@ def find_regions(
         region = Region(ends[:, None], descent.u, descent.f)
         return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
     order = rng.permutation(len(ends))
-    few = [order[labels[order] == k][:LINE_STARTS] for k in range(n_regions)]  # of each region
+    few = [order[labels[order] == k][:4] for k in range(n_regions)]  # of each region
     near = np.take(ends, np.concatenate([np.empty(0, dtype=np.int64), *few]), axis=0)
     more = max(min(2 * sizes.starts, most) - len(far) - len(near), 0)  # what wide draws do not reach, the levels do
     starts = np.concatenate([far, near, rng.permutation(descent.failing)[:more]])

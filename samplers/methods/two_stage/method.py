@@ -132,8 +132,6 @@ class TwoStage(Method):
 
 TARGET_BATCHES, MOST_BATCHES = 10, 100
 """With a target c.o.v. the budget over the first is a batch of the estimate; the second is the most of them."""
-NOISE_PROBES = 20
-"""Failures that weigh most beside which noise is looked for."""
 LEAST_FALLBACK = 300
 """Simulations under which subset simulation is not worth it."""
 SearchRun = RunContext[Simulator]
@@ -231,12 +229,7 @@ def _explore(run: SearchRun, state: RunState) -> SimulationSteps[ExplorationResu
 
 
 def _refine(
-    run: SearchRun,
-    state: RunState,
-    refinement: RefinementState,
-    number: int,
-    room: int,
-    proposal: MixtureProposal,
+    run: SearchRun, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
 ) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
     """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
     shares = (*PROPOSAL.round_shares, *PROPOSAL.further_shares)
@@ -279,21 +272,15 @@ def _look_for_noise(run: SearchRun, state: RunState, refinement: RefinementState
 
     Noise matters where failures are likely, near the origin; chains may be deep inside the failure region.
     """
-    heaviest = np.argsort(-state.history.log_weights, kind="stable")[:NOISE_PROBES]
-    if len(heaviest) < NOISE_PROBES:
+    heaviest = np.argsort(-state.history.log_weights, kind="stable")[:20]
+    if len(heaviest) < 20:
         return refinement
     noisy = yield from is_noisy(run.simulator, state.history.u[heaviest], run.goal.gamma, run.rng)
     return start_refinement(refinement.exploration.as_noisy(), run.goal.gamma, run.rng) if noisy else refinement
 
 
 def _gives_up(
-    run: SearchRun,
-    state: RunState,
-    refinement: RefinementState,
-    proposal: MixtureProposal,
-    number: int,
-    *,
-    final: bool,
+    run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal, number: int, *, final: bool
 ) -> bool:
     """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last.
 
@@ -400,7 +387,9 @@ def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, prop
 
 def _estimate_early(run: SearchRun, state: RunState) -> Outcome:
     """Return what all draws from known components say, for a run that ends before its estimate."""
-    draws = state.history.to_draws(run.simulator.inputs, run.goal.gamma)
+    u, f, log_weights = state.history.all_draws()
+    x = run.simulator.inputs.base.from_standard_normal(u)
+    draws = Draws.from_outcomes(f, log_weights + math.log(len(f)), x, run.goal.gamma)
     largest_weight = draws.n / max(len(state.base_f), 1)
     interval = weighted_interval(draws, run.goal.confidence, largest_weight, draws.cov)
     outcome = _outcome(run, state, draws, draws.cov, interval)

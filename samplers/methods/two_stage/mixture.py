@@ -107,12 +107,6 @@ class MixtureProposal:
         return draw_components(self.components, counts, rng), counts
 
 
-LEAST_MIXING = 1e-6
-"""Least weight of a component while others move; none is given up."""
-LEAST_VARIANCE_OF_COMPONENT = 1e-6
-"""Points may coincide."""
-SHORT_MEAN = 1e-9
-"""A mean shorter than this has no direction; its length divides."""
 TINY_WEIGHT = 1e-300
 """Stands for 0 if a logarithm or a quotient is taken."""
 
@@ -135,15 +129,6 @@ class GroupedPoints(NamedTuple):
         return int(self.groups.max()) + 1
 
 
-class SubspaceMixture(NamedTuple):
-    """A fitted mixture."""
-
-    components: list[SubspaceGaussian]
-    weights: FloatArray
-    score: float
-    """Log likelihood, in independent points, less the BIC penalty."""
-
-
 def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float) -> tuple[SubspaceGaussian, float]:
     """Return the component of weighted points, and the share of the shrinkage target in its covariance.
 
@@ -158,7 +143,7 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
     along = float(weights @ (u @ v - norm) ** 2)
     if dim > HIGH_DIM:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
-        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), 0.5)  # in hundreds of dimensions all is noise
+        excess = min((dim - 1) / (ess * max(norm, 1e-9) ** 2), 0.5)  # in hundreds of dimensions all is noise
         variance = np.array([min(along * (1 - excess) + excess, 4.0)])  # more comes from points of another region
         raised = inflate_variances(variance, ess)
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
@@ -173,31 +158,26 @@ def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
 
     Too small a variance makes weights unbounded, too large a one costs a few draws.
     """
-    variance = np.maximum(variance, LEAST_VARIANCE_OF_COMPONENT)
+    variance = np.maximum(variance, 1e-6)  # points may coincide
     error = math.sqrt(2 / max(ess, 2.0))
     raised = np.minimum(variance * (1 + FIT.standard_errors * error), 1.0)
     return np.where(variance < 1, raised, variance)
 
 
-def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> SubspaceMixture:
-    """Return a mixture of at most `most` components, their number chosen by BIC."""
-    best = None
-    worse = 0
+def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> list[SubspaceGaussian]:
+    """Return the components of a mixture of at most `most`, their number chosen by BIC."""
+    best, highest, worse = list[SubspaceGaussian](), -math.inf, 0
     for k in (size for size in FIT.sizes if size <= most):
         if k > 1 and (k > points.n_groups or points.ess < 4.0 * k):
             break
         restarts = 1 if k == 1 else 3  # k-means++ draws the centres
-        found = max(
-            (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
-            key=lambda mix: mix.score,
-        )
-        if best is None or found.score > best.score:
-            best, worse = found, 0
-        else:
-            worse += 1
+        tries = [_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)]
+        found, score = max(tries, key=lambda one: one[1])
+        worse = 0 if score > highest else worse + 1
+        if worse == 0:
+            best, highest = found, score
         if worse == 2:  # the score is uneven in their number: after one that is worse, a better one may follow
             break
-    assert best is not None  # one component can always be fitted
     return best
 
 
@@ -220,8 +200,11 @@ class _Fitted(NamedTuple):
     weights: FloatArray
 
 
-def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
-    """Return the mixture that expectation-maximisation reaches from responsibilities (k, n); a group stays together."""
+def _fit_from(points: GroupedPoints, start: FloatArray) -> tuple[list[SubspaceGaussian], float]:
+    """Return the components that expectation-maximisation reaches from responsibilities (k, n), and their score.
+
+    A group stays together. The score is the log likelihood, in independent points, less the penalty of BIC.
+    """
     u, weights, ess, groups = points
 
     def maximise(responsibilities: FloatArray) -> _Fitted:
@@ -240,21 +223,14 @@ def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
         per_group = np.array([np.bincount(groups, weights=row, minlength=points.n_groups) for row in per_point])
         return np.asarray((per_group + np.log(mixture.weights)[:, None])[:, groups])
 
-    once_per_group = 1 / np.bincount(groups)[groups]
-    fit, log_likelihood = expectation_maximisation(
-        maximise,
-        log_terms,
-        start,
-        once_per_group,
-        25,
-        lambda total: 1e-3 * abs(total),
-    )
+    once, least_gain = 1 / np.bincount(groups)[groups], (lambda total: 1e-3 * abs(total))  # once per group
+    fit, log_likelihood = expectation_maximisation(maximise, log_terms, start, once, 25, least_gain)
     dim = points.u.shape[1]
     most = 2.0 * dim  # with all d (d + 1) / 2 of them some dozens of points would never have a second component
     covariances = [min((1 - share) * dim * (dim + 1) / 2, most) for share in fit.target_shares]
     parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
     penalty = 0.5 * math.log(max(points.ess, 3.0)) * parameters  # the logarithm would fall under 1 with fewer
-    return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
+    return fit.components, log_likelihood - penalty
 
 
 def refit_components(
@@ -271,7 +247,7 @@ def refit_components(
         shares = posterior(log_ratios(components, u) + log_mixing[:, None])
         log_w = np.log(np.maximum(weights, TINY_WEIGHT))
         components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
-        log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), LEAST_MIXING))
+        log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), 1e-6))  # none is given up
     return components
 
 
@@ -301,12 +277,6 @@ def truncate_weights(log_weights: FloatArray) -> FloatArray:
     return np.asarray(w / w.sum())
 
 
-MIN_VARIANCE = 1e-6
-"""Smallest variance of |u|^2."""
-MIN_SCALE = 1e-3
-"""Least scale of the Gamma distribution of |u|^2: it must be positive."""
-
-
 def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     """Return the radial distribution whose |u|^2 has the moments of failures u (n, d) with weights (n,).
 
@@ -318,19 +288,9 @@ def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     outside = square > start
     excess, w = square[outside] - start, weights[outside]
     mean = float(np.average(excess, weights=w))
-    variance = max(float(np.average((excess - mean) ** 2, weights=w)), MIN_VARIANCE)
+    variance = max(float(np.average((excess - mean) ** 2, weights=w)), 1e-6)
     shape = max(mean * mean / variance, 0.3)  # with less nearly all draws are at the start
-    return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))
-
-
-WEIGHT_UPDATES = 60
-"""Multiplicative updates of the weights: they come within 2 % of the least second moment."""
-NEGLIGIBLE = 30.0
-"""Points whose weight is e^-30 of the largest one do not matter."""
-LEAST_DENSITY_RATIO = 1e-150
-"""Least ratio of densities to divide by."""
-FLOOR_ROUNDING = 1e-12
-"""A group that is this little below its floor has reached it."""
+    return RadialLaw(u.shape[1], start, shape, max(variance / mean, 1e-3))  # the scale must be positive
 
 
 class Floor(NamedTuple):
@@ -352,55 +312,42 @@ def minimise_second_moment(
     G_k = sum_i w_i (phi q_k / q_a^2)(u_i); at the optimum all G_k with a_k > 0 are equal. The floors of disjoint groups
     are kept in every update.
     """
-    matter = log_weights > log_weights.max() - NEGLIGIBLE
+    matter = log_weights > log_weights.max() - 30.0
     log_r, log_weights = log_r[:, matter], log_weights[matter]
     largest = log_r.max(axis=0)
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
-    a, limits = start, FloorIndex.of(floors, len(start))
-    for _ in range(WEIGHT_UPDATES):
-        q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
+    a = start
+    for _ in range(60):  # by then within 2 % of the least second moment
+        q = np.maximum(a @ ratio, 1e-150)
         a = a * np.sqrt(ratio @ (scaled / (q * q)))
-        a = limits.apply(a / a.sum())
+        a = keep_floors(a / a.sum(), floors)
     return a
 
 
-class FloorIndex(NamedTuple):
-    """Floors of k components as they are read in every update of the weights."""
+def keep_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
+    """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
 
-    groups: NDArray[np.intp]
-    """Floor of each component, shape (k,); m if it has none."""
-    least: list[float]
-    """Least share of each, 0 without a floor; m + 1."""
-
-    @classmethod
-    def of(cls, floors: Sequence[Floor], k: int) -> "FloorIndex":
-        """Return the floors of k components."""
-        groups = np.full(k, len(floors))
-        for number, floor in enumerate(floors):
-            groups[floor.members] = number
-        return cls(groups, [*(each.least for each in floors), 0.0])
-
-    def apply(self, a: FloatArray) -> FloatArray:
-        """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
-
-        Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
-        another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
-        proportion.
-        """
-        own = np.bincount(self.groups, a, len(self.least))
-        shares = _raise_shares(own.tolist(), self.least)
-        if shares is None:
-            return a
-        inside = np.where(own > 0, own, np.bincount(self.groups, minlength=len(own)))[self.groups]
-        return np.asarray(np.where(own[self.groups] > 0, a, 1.0) / inside * np.array(shares)[self.groups])
+    Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
+    another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
+    proportion.
+    """
+    groups = np.full(len(a), len(floors))  # the last one has no floor
+    for number, floor in enumerate(floors):
+        groups[floor.members] = number
+    own = np.bincount(groups, a, len(floors) + 1)
+    shares = _raise_shares(own.tolist(), [*(each.least for each in floors), 0.0])
+    if shares is None:
+        return a
+    inside = np.where(own > 0, own, np.bincount(groups, minlength=len(own)))[groups]
+    return np.asarray(np.where(own[groups] > 0, a, 1.0) / inside * np.array(shares)[groups])
 
 
 def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None:
     """Return shares of groups (m,) raised to their least ones, the others lowered; None if none is too low."""
     raised: set[int] = set()
     while True:
-        low = {k for k, share in enumerate(shares) if share < least[k] - FLOOR_ROUNDING} - raised
+        low = {k for k, share in enumerate(shares) if share < least[k] - 1e-12} - raised  # less is rounding
         if not low:
             return shares if raised else None
         raised |= low

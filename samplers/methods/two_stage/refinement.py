@@ -25,12 +25,12 @@ from samplers.methods.two_stage.edges import half_spaces, weighted_quantile
 from samplers.methods.two_stage.mixture import (
     NO_REGION,
     Floor,
-    FloorIndex,
     GroupedPoints,
     MixtureProposal,
     ProposalComponent,
     fit_radial,
     fit_subspace_mixture,
+    keep_floors,
     minimise_second_moment,
     refit_components,
     truncate_weights,
@@ -41,24 +41,13 @@ from samplers.methods.two_stage.stratified import MultipleImportanceSample
 from samplers.problem import FloatArray
 from samplers.sample import effective_sample_size
 
-TYPICAL_QUANTILE = 0.75
-"""Of the mean weights of chains: that of the heaviest may be where hardly any failure is."""
-PROBIT_SCALE = 1.702
-"""Log odds over the argument of Phi that is next to them: noise is near normal, and the logistic curve has far heavier
-tails (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)."""
-DISTANT_KINDS = ("base", "radial")
-"""Components whose draws are not near any region."""
-
 
 class NearDraws(NamedTuple):
-    """Draws of a round from components that lie near the regions."""
+    """Draws of a round from components that lie near the regions, which base draws and radial ones are not."""
 
-    u: FloatArray
-    """Shape (n, d)."""
-    f: FloatArray
-    """Outcomes, shape (n,)."""
-    log_weights: FloatArray
-    """log(phi / q) with q the round's proposal, shape (n,)."""
+    u: FloatArray  # (n, d)
+    f: FloatArray  # (n,)
+    log_weights: FloatArray  # log(phi / q) with q the round's proposal, (n,)
 
     def worth(self, gamma: float) -> float:
         """Return the independent failures for each draw."""
@@ -139,7 +128,7 @@ def refine_once(
 ) -> RefinementState:
     """Return the state after a round of draws."""
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
-    near = ~np.isin(kinds, DISTANT_KINDS)
+    near = ~np.isin(kinds, ("base", "radial"))
     u = batch.u[near]
     return _learn(state, history, NearDraws(u, batch.f[near], proposal.log_weights(u)), rng)
 
@@ -165,9 +154,9 @@ def _learn(
 def typical_weights(state: RefinementState, proposal: MixtureProposal, history: MultipleImportanceSample) -> FloatArray:
     """Return the weight that a typical point of each region would have as a draw of a proposal, shape (m,).
 
-    The upper quartile over the chains of the mean over their likely states: those whose |u|^2 is within the weighted
-    99 % quantile of the failures that the rounds have met. Chains start far from where failures are likely, and a few
-    may still be; 0 if a region has no likely state.
+    The upper quartile over the chains (the heaviest may be where hardly any failure is) of the mean over their likely
+    states: those whose |u|^2 is within the weighted 99 % quantile of the failures that the rounds have met. Chains
+    start far from where failures are likely, and a few may still be; 0 if a region has no likely state.
     """
     limit = math.inf
     if len(history.u):
@@ -179,7 +168,7 @@ def typical_weights(state: RefinementState, proposal: MixtureProposal, history: 
         likely = (region.chains**2).sum(axis=2) <= limit
         weights = np.exp(proposal.log_weights(region.points)).reshape(chains, steps) * likely
         means = weights.sum(axis=1)[likely.any(axis=1)] / likely.sum(axis=1)[likely.any(axis=1)]
-        typical.append(float(np.quantile(means, TYPICAL_QUANTILE)) if len(means) else 0.0)
+        typical.append(float(np.quantile(means, 0.75)) if len(means) else 0.0)
     return np.array(typical)
 
 
@@ -213,7 +202,7 @@ def _fit_chains(region: Region, most: int, rng: np.random.Generator) -> list[Sub
         ess=2.0 * chains,  # a chain is worth two independent points
         groups=np.repeat(np.arange(chains), steps),
     )
-    return fit_subspace_mixture(points, most if dim <= HIGH_DIM else 1, rng).components
+    return fit_subspace_mixture(points, most if dim <= HIGH_DIM else 1, rng)
 
 
 def _fit_linear(state: RefinementState) -> tuple[ProposalComponent, ...]:
@@ -260,33 +249,34 @@ def build_proposal(
         weights = np.where(explored, np.maximum(weights, 0.01), weights)  # kept until the last round
         keeps = keeps | explored
     weights = np.where((weights < 0.004) & ~keeps, 0.0, weights)  # some draws in thousands
-    return MixtureProposal(candidates, FloorIndex.of(floors, len(weights)).apply(weights / weights.sum()))
+    return MixtureProposal(candidates, keep_floors(weights / weights.sum(), floors))
 
 
 def list_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
     """Return the components that the next proposal may have; the first is the base distribution."""
-    gaussians = [
-        ProposalComponent(gaussian, "gaussian", explored.region)
-        for gaussian, explored in zip(state.gaussians, state.explored, strict=True)
-    ]
-    regional = (
-        gaussians
-        + ([] if state.exploration.noisy else list(state.linear))
-        + (list(state.explored) if state.rounds else [])
-    )
+    noisy, several = state.exploration.noisy, state.dim >= 2
+    owners = zip(state.gaussians, (one.region for one in state.explored), strict=True)
+    regional = [ProposalComponent(gaussian, "gaussian", region) for gaussian, region in owners]
+    regional += [*(() if noisy else state.linear), *(state.explored if state.rounds else ())]
+    laws = [fit_radial(state.points, np.ones(len(state.points)))] if several else []
+    if several and len(history.u) >= 20:  # moments of |u|^2 need so many
+        laws.append(fit_radial(history.u, np.exp(history.log_weights - history.log_weights.max())))
     directional = []
-    if state.exploration.scattered and state.dim >= 2:  # failures are something like a shell or a cone
-        law = VonMisesFisherNakagami.fit(*_weighted_failures(state, history))
-        directional = [ProposalComponent(law, "directional")]
-    candidates = [
+    if state.exploration.scattered and several:  # failures are something like a shell or a cone
+        directional = [VonMisesFisherNakagami.fit(*_weighted_failures(state, history))]
+    return [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
-        *_fit_radial_components(state, history),
+        *(ProposalComponent(law, "radial") for law in laws),
         *regional,
-        *directional,
-        *_temper_gaussians(regional, (0.5, 0.25) if state.exploration.noisy else (0.5,)),
+        *(ProposalComponent(law, "directional") for law in directional),
+        *(
+            ProposalComponent(one.component.temper(power), "tempered", one.region)
+            for one in regional
+            if isinstance(one.component, SubspaceGaussian)
+            for power in ((0.5, 0.25) if noisy else (0.5,))
+        ),
+        *_lift_candidates(state, history),
     ]
-    candidates += _lift_candidates(state, history)
-    return candidates
 
 
 def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
@@ -301,27 +291,6 @@ def _lift_candidates(state: RefinementState, history: MultipleImportanceSample) 
     spread = SubspaceGaussian(across, np.zeros(len(values)), np.maximum(values, 1.0))
     inside.append(ProposalComponent(spread, "spread"))
     return [candidate._replace(component=LiftedComponent(candidate.component, axes)) for candidate in inside]
-
-
-def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
-    """Return the tempered versions of the Gaussians among the components."""
-    return [
-        ProposalComponent(candidate.component.temper(power), "tempered", candidate.region)
-        for candidate in components
-        if isinstance(candidate.component, SubspaceGaussian)
-        for power in powers
-    ]
-
-
-def _fit_radial_components(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
-    """Return radial components around the chains' points and around the weighted failures; none in one dimension."""
-    if state.dim < 2:
-        return []
-    radial = [fit_radial(state.points, np.ones(len(state.points)))]
-    if len(history.u) >= 20:  # moments of |u|^2 need so many
-        log_w = history.log_weights
-        radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
-    return [ProposalComponent(component, "radial") for component in radial]
 
 
 def _weighted_failures(state: RefinementState, history: MultipleImportanceSample) -> tuple[FloatArray, FloatArray]:
@@ -390,5 +359,6 @@ def _smooth_indicators(history: MultipleImportanceSample, gamma: float) -> tuple
     degree = 2 if u.shape[1] <= 20 else 1  # 231 coefficients at most
     x = PolynomialFeatures(degree, include_bias=False).fit_transform(u)
     model = LogisticRegression(C=100.0, max_iter=2000, random_state=0)  # hardly any penalty
-    odds = model.fit(x, f <= gamma).decision_function(x) / PROBIT_SCALE
-    return u, log_w + log_ndtr(odds)
+    # Noise is near normal, and the logistic curve has far heavier tails: its log odds over the argument of Phi that is
+    # next to them (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)
+    return u, log_w + log_ndtr(model.fit(x, f <= gamma).decision_function(x) / 1.702)

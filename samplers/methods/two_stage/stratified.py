@@ -79,15 +79,6 @@ class MultipleImportanceSample:
         f = np.concatenate([batch.f for batch in self.batches])
         return u, f, -mixture_log_ratio(log_ratios(self.components, u), self.counts)
 
-    def to_draws(self, inputs: Inputs, gamma: float) -> Draws:
-        """Return all draws as those from one proposal."""
-        u, f, log_weights = self.all_draws()
-        return Draws.from_outcomes(f, log_weights + math.log(len(f)), inputs.base.from_standard_normal(u), gamma)
-
-
-MAX_LOG_WEIGHT = 700.0
-"""exp(709) is the largest number; base draws bound all weights that matter far below."""
-
 
 @dataclass(frozen=True, eq=False)
 class StratifiedSample:
@@ -120,7 +111,8 @@ class StratifiedSample:
         ratios, log_weights = drawn.kind_ratios(batch.u)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
         calibration = calibrate(ratios, owner, 30)  # slopes of fewer draws for each control bias
-        y = calibration.residuals(np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0))
+        weights = np.exp(np.minimum(log_weights, 700.0))  # exp(709) is the largest number; base draws bound them
+        y = calibration.residuals(np.where(fails, weights, 0.0))
         x = inputs.base.from_standard_normal(batch.u) if batch.x is None else batch.x
         log_weights = log_weights + np.log(calibration.factors)
         largest = float(calibration.factors[fails].max(initial=1.0)) / drawn.weights[0]
@@ -175,12 +167,7 @@ class StratifiedSample:
         return math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p)
 
     def to_sample(
-        self,
-        proposal: MixtureProposal,
-        base_f: FloatArray,
-        base_u: FloatArray,
-        gamma: float,
-        counted: Draws,
+        self, proposal: MixtureProposal, base_f: FloatArray, base_u: FloatArray, gamma: float, counted: Draws
     ) -> Sample:
         """Return the weighted points behind p: failing draws as they are, the others together with base draws.
 
