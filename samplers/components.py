@@ -27,9 +27,6 @@ from scipy.special import gammaln, ive, log_ndtr, logsumexp, ndtri_exp
 from samplers.bases import LOG_TWO_PI
 from samplers.problem import FloatArray
 
-ROWS_FROM = 8
-"""With so many coordinates sums over them are taken point by point; fewer are added in the same order either way."""
-
 
 class MixtureComponent(Protocol):
     """A distribution in standard normal space with a known density ratio to N(0, I)."""
@@ -74,7 +71,7 @@ class SubspaceGaussian:
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the log ratio; it depends on the coordinates along the axes only."""
         t, mean, variance, axis = u @ self.axes, self.mean, self.variance, 1
-        if len(mean) < ROWS_FROM:  # the same sums, coordinate by coordinate
+        if len(mean) < 8:  # coordinate by coordinate: so few are added in the same order either way
             t, mean, variance, axis = np.ascontiguousarray(t.T), mean[:, None], variance[:, None], 0
         terms = t * t - (t - mean) ** 2 / variance - np.log(variance)
         return np.asarray(0.5 * terms.sum(axis=axis))
@@ -199,11 +196,9 @@ def draw_components(
     return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True)])
 
 
-LARGEST_RESULTANT = 0.999  # Mean resultant lengths above are cut: a few close points would make kappa run away
 LEAST_CONCENTRATION = 1e-3  # Stands for 0, where the direction is uniform: the formulae divide by it
 LEAST_SHAPE = 0.5  # Least m of a Nakagami distribution
 LARGEST_SHAPE = 1e4  # A radius with a c.o.v. of 0.5 %; points at one radius would give an infinite m
-LARGE_ORDER = 50.0  # Order of a Bessel function from which on its asymptotic expansion is used, exact to 2e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +229,7 @@ class VonMisesFisherNakagami:
         mu = resultant / length if length > 0 else np.eye(dim)[0]
         chance = float(weights @ weights)
         length = math.sqrt(max((length**2 - chance) / (1 - chance), 0.0)) if chance < 1 else length
-        r = min(length, LARGEST_RESULTANT)
+        r = min(length, 0.999)  # a few close points would make kappa run away
         kappa = max(r * (dim - r * r) / (1 - r * r), LEAST_CONCENTRATION)  # Banerjee et al., equation 4.4
         square = float(weights @ radius**2)
         spread = float(weights @ (radius**2 - square) ** 2)
@@ -276,9 +271,9 @@ class VonMisesFisherNakagami:
 def log_normaliser(kappa: float, dim: int) -> float:
     """Return log kappa^v - log (2 pi)^(v + 1) - log I_v(kappa), v = d / 2 - 1, of the density."""
     v = dim / 2 - 1
-    if v < LARGE_ORDER:
+    if v < 50:
         log_bessel = math.log(float(ive(v, kappa))) + kappa
-    else:
+    else:  # the asymptotic expansion is exact to 2e-7
         root = math.hypot(v, kappa)
         t = v / root
         series = 1 + (3 * t - 5 * t**3) / (24 * v) + (81 * t**2 - 462 * t**4 + 385 * t**6) / (1152 * v * v)

@@ -180,10 +180,6 @@ class BetaBlock:
         return np.log(np.maximum(y, SMALLEST)), np.log(np.maximum(rest, SMALLEST))
 
 
-EM_STEPS = 10
-"""M-steps per step of cross-entropy, always all of them; each one raises the objective."""
-KMEANS_RESTARTS = 3
-"""Starts of k-means, of which the best is taken: one alone may put two centres into one region."""
 EMPTY = float(np.finfo(np.float64).eps)
 """A component with less weight has no points left."""
 
@@ -198,7 +194,7 @@ def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatA
         from sklearn.cluster import KMeans  # over a second to import
 
         k = min(k, len(np.unique(x, axis=0)))
-        clusters = KMeans(k, n_init=KMEANS_RESTARTS, random_state=0).fit(x, sample_weight=weights)
+        clusters = KMeans(k, n_init=3, random_state=0).fit(x, sample_weight=weights)  # one may put two into one region
         start = one_hot(np.asarray(clusters.labels_, dtype=np.int64), k)
         present = Mixture(np.full(k, 1 / k), [present.components[0]] * k)
     else:
@@ -218,8 +214,8 @@ def fit_mixture_towards(present: Mixture, k: int, x: FloatArray, weights: FloatA
             components.append(component)
         return Mixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
 
-    mixture, _ = expectation_maximisation(
-        maximise, lambda mixture: mixture.log_terms(x), start, weights, EM_STEPS, lambda _: -np.inf
+    mixture, _ = expectation_maximisation(  # always ten steps, each of which raises the objective
+        maximise, lambda mixture: mixture.log_terms(x), start, weights, 10, lambda _: -np.inf
     )
     used = mixture.weights > EMPTY
     components = [component for component, kept in zip(mixture.components, used, strict=True) if kept]

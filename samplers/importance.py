@@ -259,23 +259,15 @@ def round_record(level: float, n: int, log_weights: FloatArray) -> Level:
     )
 
 
-MOST_FINAL_BATCHES = 100
-"""Batches of final draws after which a target c.o.v. is given up if max_sim does not say."""
-
-
 def count_final_draws(goal: Goal, spent: int, n_final: int) -> int:
     """Return how many final draws may be made after a search, in batches of n_final."""
     if goal.max_sim is not None:
         return goal.max_sim - spent
-    return n_final * (1 if goal.target_cov is None else MOST_FINAL_BATCHES)
+    return n_final * (1 if goal.target_cov is None else 100)
 
 
 LEAST_SEARCH_BUDGET = 100
 """With a smaller max_sim all draws are base draws: ten rounds of ten draws are the least that can be fitted to."""
-SEARCH_SHARE = 2 / 3
-"""Largest share of max_sim that a search may use; a third at least is left for the final draws."""
-LEAST_ROUNDS = 10
-"""A round is at most max_sim / LEAST_ROUNDS, so that about seven of them fit into the share of the search."""
 
 
 class Round(NamedTuple):
@@ -324,10 +316,10 @@ class Search:
     ) -> Generator[FloatArray, FloatArray, Round | None]:
         """Simulate n_round draws, fewer if max_sim is small; None if the search is over, its status says why."""
         budget = self.goal.budget
-        size = min(n_round, budget // LEAST_ROUNDS)
+        size = min(n_round, budget // 10)  # about seven rounds fit into the share of the search
         if len(self.trace) == max_rounds:
             return None
-        if budget < LEAST_SEARCH_BUDGET or self.n_sim + size > int(SEARCH_SHARE * budget):
+        if budget < LEAST_SEARCH_BUDGET or self.n_sim + size > int(2 / 3 * budget):  # a third is for the final draws
             self.status = Status.BUDGET
             return None
         u = proposal.sample(size, self.rng)

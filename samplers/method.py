@@ -1,15 +1,27 @@
-"""Contract of a method (`Stepping`), its goal and outcome, what a whole run has found; the simplest: plain draws."""
+"""Contract of a method (`Stepping`, `Method`), its goal and outcome, and what a whole run has found."""
 
 import math
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol, cast, runtime_checkable
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.problem import Distribution, FloatArray, Inputs, TermGradients, Terms, check_settings
+from samplers.problem import (
+    ON_ERROR,
+    Distribution,
+    FloatArray,
+    Inputs,
+    OnError,
+    TermGradients,
+    Terms,
+    check_name,
+    check_number,
+    check_whole,
+)
 from samplers.sample import (
     COARSE,
     Closest,
@@ -26,6 +38,9 @@ from samplers.sample import (
     clopper_pearson,
     normalise_weights,
 )
+
+if TYPE_CHECKING:
+    from samplers.run import Run
 
 MANY_FAILURES = 5
 """Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
@@ -333,6 +348,117 @@ class Stepping(Protocol):
 
 
 @dataclass(frozen=True)
+class RunArguments:
+    """Arguments of one run; their defaults are those of `estimate`, `Method.start` and the command line.
+
+    Raises:
+        ValueError: If an argument is out of range; the text says what was expected.
+
+    Example:
+        >>> from samplers.run import RunArguments
+        >>> arguments = RunArguments(max_sim=6000, seed=1)
+        >>> arguments.gamma, arguments.confidence, arguments.replicates
+        (0.0, 0.95, 1)
+        >>> RunArguments(confidence=95)
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected confidence to be a number between 0 and 1, got 95.
+    """
+
+    gamma: float = 0.0
+    """Threshold of failure, f <= gamma."""
+    seed: int | None = None
+    """Same seed, same answer; None draws one."""
+    max_sim: int | None = None
+    """Simulations that are never exceeded, over all replicates; None leaves it to the method."""
+    target_cov: float | None = None
+    """Coefficient of variation to stop at; None leaves it to the method."""
+    confidence: float = Goal.confidence
+    """Nominal coverage of the interval."""
+    replicates: int = 1
+    """Independent runs, side by side."""
+    on_error: OnError = "raise"
+    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing but for the lower limit."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_number("gamma", self.gamma, -math.inf, math.inf)
+        check_number("confidence", self.confidence, 0.0, 1.0)
+        if self.target_cov is not None:
+            check_number("target_cov", self.target_cov, 0.0, math.inf)
+        check_whole("replicates", self.replicates, 1)
+        if self.max_sim is not None:
+            check_whole("max_sim", self.max_sim, self.replicates)
+            if self.max_sim > 10**12:  # more is a slip of the keyboard
+                raise ValueError(f"Expected max_sim to be at most {10**12:,}, got {Decimal(self.max_sim):.3g}.")
+        if self.seed is not None:
+            check_whole("seed", self.seed, 0)
+        check_name("on_error", self.on_error, list(ON_ERROR))
+
+
+@runtime_checkable
+class Method(Stepping, Protocol):
+    """A method to subclass: write `steps`, and `start` comes with it.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> class OneBatch(samplers.methods.Method):
+        ...     name, stops_at_target = "one-batch", False
+        ...     def steps(self, inputs, goal, rng):
+        ...         n = min(goal.budget, 4000)
+        ...         f = yield inputs.base.sample(n, rng)
+        ...         hits = int((f <= goal.gamma).sum())
+        ...         return samplers.methods.Outcome.of_counts(hits, n, goal.confidence, trace=())
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, OneBatch(), seed=0)
+        >>> result.n_sim, result.p
+        (4000, 0.01975)
+    """
+
+    def start(
+        self,
+        problem: Inputs,
+        gamma: float = RunArguments.gamma,
+        seed: int | None = RunArguments.seed,
+        max_sim: int | None = RunArguments.max_sim,
+        target_cov: float | None = RunArguments.target_cov,
+        confidence: float = RunArguments.confidence,
+        replicates: int = RunArguments.replicates,
+        on_error: OnError = RunArguments.on_error,
+    ) -> "Run":
+        """Start a run whose simulations you make yourself: `ask` for points, `tell` their outcomes.
+
+        Args:
+            problem: Has `dim` and `base`; `evaluate` is not needed.
+            gamma: As the others, see `samplers.estimate`, which gives the same result.
+            seed: Same seed, same answer.
+            max_sim: Simulations that are never asked for more of.
+            target_cov: Coefficient of variation to stop at.
+            confidence: Nominal coverage of the interval.
+            replicates: Independent runs, side by side in every batch.
+            on_error: What NaN among the outcomes means.
+
+        Raises:
+            ValueError: If an argument is not as described in `estimate`.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+            >>> run = samplers.MonteCarlo(batch=1000).start(problem, seed=0, max_sim=2000)
+            >>> while not run.done:
+            ...     x = run.ask()
+            ...     print(x.shape)
+            ...     run.tell(2.0 - x[:, 0])
+            (1000, 2)
+            (1000, 2)
+        """
+        from samplers.run import Run  # which makes sums of methods
+
+        arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
+        return Run(problem, self, arguments)
+
+
+@dataclass(frozen=True)
 class Choice:
     """A method that another one chose for a run, such as `Auto`, and why, its name first.
 
@@ -414,88 +540,3 @@ class EstimateData(Outcome):
             inside = (run == weights.run) & (row >= 0) & (row < len(weights.log_weights))
             log_weight[inside] = weights.log_weights[row[inside]] + weights.log_share
         return SimulationRows(run, stage, log_weight)
-
-
-# Plain draws
-
-MOST_DRAWS = 2**20
-"""Draws whose f is kept at most, 8 MiB."""
-MOST_FAILING_BYTES = 2**26
-"""Bytes of failing points that are kept at most."""
-
-
-class KeptDraws:
-    """Independent draws of equal weight: p is that of all, and the first ones are kept."""
-
-    def __init__(self, gamma: float, dim: int, most: int = MOST_DRAWS, most_failing: int | None = None) -> None:
-        self._gamma, self._most = gamma, most
-        self._room = most_failing or MOST_FAILING_BYTES // (8 * dim)
-        self._hits = self._n = self._n_missing = 0
-        self._f, self._x, self._f_failing = [np.empty(0)], [np.empty((0, dim))], [np.empty(0)]
-
-    def add(self, x: FloatArray, f: FloatArray) -> None:
-        """Add draws x (n, d) with outcomes f (n,)."""
-        fails, room = f <= self._gamma, max(self._room - self._hits, 0)
-        self._f.append(f[: max(self._most - self._n, 0)])
-        self._x.append(x[fails][:room])
-        self._f_failing.append(f[fails][:room])
-        self._n, self._hits = self._n + len(f), self._hits + int(fails.sum())
-        self._n_missing += int(np.isneginf(f[fails]).sum())
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Failing draws and all draws."""
-        return self._hits, self._n
-
-    def outcome(self, goal: Goal, trace: list[Level]) -> Outcome:
-        """Return the outcome of a run that ends with them; kept draws stand for all, and their weights make p exact."""
-        (hits, n), f = self.counts, np.concatenate(self._f)
-        x, failing = np.concatenate(self._x), np.concatenate(self._f_failing)
-        if len(f) == n and len(x) == hits:
-            sample = Sample.of_equal_draws(f, x)
-        else:
-            safe = f[f > self._gamma]
-            k = len(failing) + len(safe)
-            weights = [np.full(m, of / (n * m)) for of, m in ((hits, len(failing)), (n - hits, len(safe))) if m]
-            f, units = np.concatenate([failing, safe]), np.arange(k, dtype=np.int64)
-            sample = Sample(f=f, weights=np.concatenate(weights), units=units, n_units=k, x=x)
-        missing = self._n_missing / hits if hits else 0.0
-        outcome = Outcome.of_counts(hits, n, goal.confidence, trace, missing)
-        return replace(outcome, sample=sample, draw_weights=(DrawWeights.of_equal_draws(n, 0, n),))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlainDraws:
-    """The share of failing points among independent draws, by batches: what `samplers.MonteCarlo` is made of."""
-
-    n: int = 100_000
-    batch: int = 10_000
-
-    name: ClassVar[str] = "mc"
-    stops_at_target: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        check_settings(self, n=1, batch=1)
-
-    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
-        """Draw batches until the target or the end of the budget."""
-        budget = self.n if goal.max_sim is None else goal.max_sim
-        draws, trace = KeptDraws(goal.gamma, inputs.dim), list[Level]()
-        n, met = 0, False
-        while n < budget and not met:
-            size = min(self.batch, budget - n)
-            x = inputs.base.sample(size, rng)
-            try:
-                f = yield x
-            except Interrupted:
-                if n == 0:  # the caller, who has simulated before, has the outcome
-                    raise
-                return replace(draws.outcome(goal, trace), status=Status.STOPPED)
-            draws.add(x, f)
-            (hits, n), share = draws.counts, float((f <= goal.gamma).mean())
-            cov = binomial_cov(hits / n, n)
-            met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
-            trace.append(Level(gamma=goal.gamma, p=share, estimate=hits / n, n_sim=size, n_points=size, cov=cov))
-            goal.on_level(trace[-1])
-        return draws.outcome(goal, trace)

@@ -108,14 +108,6 @@ def move_gaussian(present: Gaussian, u: FloatArray, weights: FloatArray, share: 
 
 Fit = Callable[[FloatArray, FloatArray], Any]
 """Fits one component, which can `widen`, to points (n, d) with weights (n,) that add up to 1."""
-MAX_EM_STEPS = 50
-"""M-steps at most."""
-LEAST_EM_GAIN = 1e-3
-"""Expectation-maximisation ends where a step raises the mean log likelihood by less."""
-LEAST_WEIGHT = 0.01
-"""Components of less weight are dropped: with 1000 points they would rest on fewer than 10."""
-LEAST_OF_EVEN_SHARE = 0.5
-"""Of more than 50 components, those with less than this share of 1 / k are: the heaviest one always stays."""
 
 
 def fit_proposal_mixture(
@@ -144,14 +136,13 @@ def _fit_mixture_of_size(fit: Fit, u: FloatArray, weights: FloatArray, k: int, r
     def maximise(responsibilities: FloatArray) -> Mixture:
         mass = weights * responsibilities
         totals = mass.sum(axis=1)
-        kept = totals > min(LEAST_WEIGHT, LEAST_OF_EVEN_SHARE / k)
+        kept = totals > min(0.01, 0.5 / k)  # of 1000 points fewer than 10; the heaviest one always stays
         components = [fit(u, part / part.sum()) for part in mass[kept]]
         return Mixture(totals[kept] / totals[kept].sum(), components)
 
     # Separate regions of failure lie in separate directions from the origin.
     directions = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     start = start_from_centres(directions, weights, k, rng)
-    mixture, _ = expectation_maximisation(
-        maximise, lambda mixture: mixture.log_terms(u), start, weights, MAX_EM_STEPS, lambda _: LEAST_EM_GAIN
-    )
+    terms, least_gain = (lambda mixture: mixture.log_terms(u)), (lambda _: 1e-3)
+    mixture, _ = expectation_maximisation(maximise, terms, start, weights, 50, least_gain)
     return mixture

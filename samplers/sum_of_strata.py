@@ -39,7 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Stepping, Steps, offer_of
+from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, offer_of
+from samplers.methods.monte_carlo import MonteCarlo
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     DISAGREEMENT_LEVEL,
@@ -151,7 +152,7 @@ class _Sum:
         """Return a first run for every stratum, or for the largest ones if there are fewer simulations."""
         k, n, target = len(self.parts), self.goal.max_sim, self.goal.target_cov
         target = max(target, PILOT_COV) if target is not None and self.method.stops_at_target else None
-        method = PlainDraws() if self.chooses else None
+        method = MonteCarlo() if self.chooses else None
         if n is None:
             return [(i, PILOT_DRAWS if self.chooses else None, target, method) for i in range(k)]
         few = n < FEWEST * k
@@ -194,7 +195,7 @@ class _Sum:
             rare = []
         self.searched |= seldom - {*rare}
         if left is None and target is None:
-            draws = {i: (self.plain_draws, None, PlainDraws()) for i in range(k) if i not in rare}
+            draws = {i: (self.plain_draws, None, MonteCarlo()) for i in range(k) if i not in rare}
             return [(i, *draws.get(i, (None, None, None))) for i in range(k)]
         if not rare:
             return self._plan_more()
@@ -211,7 +212,7 @@ class _Sum:
         """Return plain draws for a stratum that often fails, or that was searched in vain; else None."""
         drawn = self.parts[stratum].outcome.counts is not None
         in_vain = stratum in self.searched and (drawn or self._is_unresolved(stratum))
-        return PlainDraws() if self.chooses and (self._fails_often(stratum) or in_vain) else None
+        return MonteCarlo() if self.chooses and (self._fails_often(stratum) or in_vain) else None
 
     def _has_draws_next(self, stratum: int) -> bool:
         """Return whether plain draws come next in a stratum that is not resolved: all count in its upper limit."""
@@ -228,7 +229,7 @@ class _Sum:
         empty = [i for i in range(len(self.parts)) if self._is_unresolved(i)]
         whole = sum(self.parts[i].share for i in empty)
         drawn = [(i, int(n * self.parts[i].share / whole)) for i in empty]
-        return [(i, size, None, PlainDraws()) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
+        return [(i, size, None, MonteCarlo()) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
 
     def _allocate(self, use: NDArray[np.bool_], parts: Sequence[Part]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""

@@ -8,18 +8,10 @@ from typing import ClassVar
 import numpy as np
 
 from samplers.importance import Search
-from samplers.method import Goal, Steps
-from samplers.methods.base import Method
+from samplers.method import Goal, Method, Steps
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.proposals import Gaussian, ProposalDistribution
 from samplers.sample import Status, next_level, normalise_weights
-
-QUANTILE = 1.96
-"""Half-widths are those of 95 % intervals."""
-MOST_UNREACHED = 0.05
-"""Share of the points on the way to failure that may lie where the tilt does not lead."""
-FITS_AT_GAMMA = 2
-"""Rounds with the level at gamma: the second fit is to draws from a proposal that reaches the failures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +87,7 @@ class ImportanceSampling(Method):
     @property
     def own_target(self) -> float:
         """Coefficient of variation to stop at if the goal has none."""
-        return self.half_width / QUANTILE
+        return self.half_width / 1.96
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""
@@ -103,7 +95,7 @@ class ImportanceSampling(Method):
         tilt = yield from self._search(search, inputs.dim)
         missed = unreached_share(search, tilt.mean) if tilt and search.status is not Status.STOPPED else 0.0
         sampler, doubts = search.mix(tilt, self.base_share), search.warnings()
-        if missed > MOST_UNREACHED:
+        if missed > 0.05:
             where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
             sampler, doubts = search.base, [f"{where}: draws from the base distribution replace it."]
         target = self.own_target if goal.target_cov is None else goal.target_cov
@@ -132,7 +124,7 @@ class ImportanceSampling(Method):
                 return tilt
             proposal = tilt = Gaussian(normalise_weights(log_weights[inside]) @ last.u[inside], identity)
             reached += level == gamma
-            if reached == FITS_AT_GAMMA:
+            if reached == 2:  # the second fit was to draws from a proposal that reaches the failures
                 break
         if reached and search.status is not Status.STOPPED:
             search.status = Status.CONVERGED

@@ -10,18 +10,11 @@ from scipy.special import log_ndtr
 
 from samplers.components import VonMisesFisherNakagami
 from samplers.importance import Search
-from samplers.method import Goal, Steps
-from samplers.methods.base import Method
+from samplers.method import Goal, Method, Steps
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.proposals import Mixture, ProposalDistribution, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import Status, normalise_weights
 
-WIDEST = 10.0
-NARROWEST = 1e-15
-"""Smoothing widths that are looked at, in units of the median of |f - gamma|. At the widest the smooth indicator is
-nearly constant, at the narrowest it is the indicator itself in double precision."""
-BISECTIONS = 60
-"""Halvings of the logarithm of the width: 36 / 2^60 is rounding."""
 HUGE = 1e300
 """Outcomes from there on stand for infinite ones and say nothing about the scale of f."""
 
@@ -125,7 +118,8 @@ class ImprovedCrossEntropy(Method):
                     return None
                 sizes = np.abs(g[(np.abs(g) < HUGE) & (g != 0)])
                 scale = float(np.median(sizes)) if len(sizes) else 1.0
-                width, narrowest = WIDEST * scale, NARROWEST * scale
+                # at the widest the indicator is nearly constant, at the narrowest itself in double precision
+                width, narrowest = 10 * scale, 1e-15 * scale
             width = next_width(g, log_ratio, self.weight_cov, narrowest, width)
             if reached or (width == narrowest and (g <= 0).any()):
                 search.status = Status.CONVERGED
@@ -170,7 +164,7 @@ def next_width(g: FloatArray, log_ratio: FloatArray, target: float, low: float, 
         return low
     if weights_cov(log_smooth_indicator(g, high) + log_ratio) >= target:
         return high
-    for _ in range(BISECTIONS):
+    for _ in range(60):  # 36 / 2^60, of the logarithm, is rounding
         middle = math.sqrt(low) * math.sqrt(high)
         if weights_cov(log_smooth_indicator(g, middle) + log_ratio) > target:
             low = middle

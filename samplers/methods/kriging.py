@@ -28,10 +28,6 @@ from scipy.special import log_ndtr
 from samplers.problem import FloatArray
 
 MANY_DIMS = 20  # In more the covariance has one length, and a linear part
-MOST_INFLATION = 3.0
-"""Standard deviations are inflated by the root mean square of standardised residuals, by no more."""
-REFIT_GROWTH = 1.4  # Covariance parameters are searched anew each time the points have grown by this factor
-MOST_POINTS = 200  # Points nearest to the limit state that they are searched with; a step costs their cube
 
 
 class Prediction(NamedTuple):
@@ -84,7 +80,7 @@ class Outcomes(NamedTuple):
 
 def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> Kriging:
     """Fit a process to outcomes y = f - gamma (n,), infinite ones too, at u (n, d), after another of fewer."""
-    if before is None or len(y) >= REFIT_GROWTH * before.n_searched:
+    if before is None or len(y) >= 1.4 * before.n_searched:
         # a search begins afresh: from the last result it may stay where few points had led it
         kernel, scale, n_searched, search = _initial_kernel(u.shape[1]), outcome_scale(y), len(y), True
     else:
@@ -104,7 +100,7 @@ def fit_kriging(u: FloatArray, y: FloatArray, before: Kriging | None = None) -> 
     limit, residuals = -mean / sd, (standard - left_out) / left_out_sd
     near = np.abs(left_out - limit) < 6 * left_out_sd
     inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0
-    inflation = min(max(inflation, 1.0), MOST_INFLATION)
+    inflation = min(max(inflation, 1.0), 3.0)
     if outcomes.floored.any():  # these do not tell where f would be 0
         limit += _find_shift(left_out - limit, inflation * left_out_sd, y <= 0)
     skill = 1 - float(((standard - left_out) ** 2).mean())
@@ -166,6 +162,6 @@ def _fit_process(kernel: Any, u: FloatArray, z: FloatArray, *, search: bool) -> 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # parameters at their bounds are no concern
         if search:
-            nearest = np.argsort(np.abs(z), kind="stable")[:MOST_POINTS]
+            nearest = np.argsort(np.abs(z), kind="stable")[:200]  # to the limit state; a step costs their cube
             kernel = GaussianProcessRegressor(kernel, optimizer=climb).fit(u[nearest], standard[nearest]).kernel_
         return GaussianProcessRegressor(kernel, optimizer=None).fit(u, standard), standard, mean, sd

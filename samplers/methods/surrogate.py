@@ -19,8 +19,8 @@ from scipy.special import logsumexp, ndtri
 
 from samplers.bases import Gaussian
 from samplers.importance import Draws, count_final_draws, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
-from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
+from samplers.methods.base import SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.kriging import MANY_DIMS, Kriging, Prediction, fit_kriging
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.two_stage.regions import count_lineages
@@ -41,19 +41,15 @@ from samplers.sample import (
 LEAST_BUDGET = 60  # With fewer simulations all are base draws
 SCALES = (1.0, 1.5, 2.2, 3.0)
 """Standard deviations of the first design, a quarter each; at 3 a plane at beta = 4.5 is crossed by one in 15."""
-LEARNING_SHARE = 2 / 3  # Largest share of the budget to learn from; a third at least is left for the estimate
-MOST_LEARNING = 300  # Simulations at most: the cost of kriging grows with their cube
 DOUBT = 4.0
 """Factor on standard deviations of a surrogate that is not believed: points are left out at a learned limit state lie
 close together, so that their residuals say little of what is between them."""
-FORECAST_COV = 0.02  # Learning ends where the draws left would give this c.o.v., in two batches one after the other
 FINAL_POOL = 20_000  # Draws of the last pool; its own error is 1 / sqrt(those that may fail), a part of the c.o.v.
 PART_SHARES, BASE = np.array([0.75, 0.1, 0.15]), 1
 """Shares of what the surrogate says, of base draws, and of what it would say if it were doubted. No weight exceeds
 1 / the share of base draws but for the error of the pool. On the IDM cut-in, 300 simulations, 10 seeds: without doubted
 draws and random points 8 of 10 intervals held p and the gain was 34; with doubted draws alone 10 and 76, with both 10
 and 190."""
-LEAST_ESS = 10.0  # Effective failing draws below which the upper end is Bernstein's bound, or that of the base draws
 LEAST_SKILL = 0.4
 """Share of the variance of f that is to be predicted of points left out, in many dimensions: with 100 base draws it is
 0.41 to 0.95 where one or two planes or a sum of claims fail, 0.28 for four planes, up to 0.13 for a ring or a first
@@ -232,7 +228,7 @@ class SurrogateRun:
 
     def _learn(self, kriging: Kriging) -> SimulationSteps[tuple[Kriging, Mixture]]:
         """Simulate batches where the surrogate is in doubt, until it is good enough or has its share of the budget."""
-        most = min(int(LEARNING_SHARE * self.budget), MOST_LEARNING)
+        most = min(int(2 / 3 * self.budget), 300)  # the cost of kriging grows with the cube
         if self.may_leave and not self.many and self.budget >= LEAST_LEFT + 200:
             most = 200
         size = max((most - self.n_design) // 16, 6)  # simulators run the points of one batch side by side
@@ -246,7 +242,7 @@ class SurrogateRun:
             surprises.append(float(fails.sum() - predicted.sum()))
             # 1.5 standard errors of two batches: at a limit state that is elsewhere all of their points fail, or none
             allowed = 1.5 * math.sqrt(2 * float((predicted * (1 - predicted)).sum()) + 1)
-            sharp = fails.any() and pool.forecast_cov(self.budget - len(self.f)) < FORECAST_COV
+            sharp = fails.any() and pool.forecast_cov(self.budget - len(self.f)) < 0.02
             good = good + 1 if sharp and abs(sum(surprises[-2:])) <= allowed else 0
             mixture = fit_mixture(pool, self.rng)
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging)
@@ -266,8 +262,7 @@ class SurrogateRun:
         """
         goal, cov, status = self.goal, math.inf, Status.CONVERGED
         draws = Draws(0, np.empty(0), np.empty(0))
-        of_base = self.f[: self.n_base]  # outcomes of base draws
-        foreseen = spread = hits = 0.0  # failures of the final draws: predicted, their variance, met
+        of_base, likely = self.f[: self.n_base], np.empty(0)  # outcomes of base draws; P[fail] of the final ones
         left = count_final_draws(goal, len(self.f), self.budget - len(self.f))
         pool, mixture = self._draw_pool(kriging, mixture)
         size = min(1000, math.ceil(left / 2)) if goal.target_cov is None else max(self.budget // 10, 1)
@@ -280,26 +275,34 @@ class SurrogateRun:
             except Interrupted:
                 status = Status.STOPPED
                 break
-            fails, predicted = f <= goal.gamma, np.exp(pool.prediction.log_fail[rows])
-            foreseen, hits = foreseen + float(predicted.sum()), hits + int(fails.sum())
-            spread += float((predicted * (1 - predicted)).sum())
+            likely = np.concatenate([likely, np.exp(pool.prediction.log_fail[rows])])
             draws = draws.join(Draws.from_outcomes(f, log_weights, x, goal.gamma))
             of_base = np.concatenate([of_base, f[from_base]])
             may_fail = effective_sample_size(pool.log_weights + pool.prediction.log_fail)
             cov = math.hypot(draws.cov, math.sqrt(1 / may_fail))
             left -= len(f)
-            self.simulator.record(float(fails.mean()), draws.p, len(f), cov, draws.ess)
+            self.simulator.record(float((f <= goal.gamma).mean()), draws.p, len(f), cov, draws.ess)
             if left > 0 and draws.n < 1000:  # kriging costs the cube of their number
                 self._keep(u, f)
                 kriging = fit_kriging(self.u, self.f - goal.gamma, kriging)
                 pool, mixture = self._draw_pool(kriging, mixture)
         if draws.n == 0:
             return self.estimate_early(status if status is Status.STOPPED else Status.BUDGET)
+        return self._conclude(draws, cov, status, pool, of_base, likely)
+
+    def _conclude(
+        self, draws: Draws, cov: float, status: Status, pool: Pool, of_base: FloatArray, likely: FloatArray
+    ) -> Outcome:
+        """Return the outcome of the final draws, of which kriging said how `likely` they fail.
+
+        Failures that are not as many as kriging said, by 4 standard deviations, give a warning.
+        """
+        goal, hits, foreseen = self.goal, len(draws.f), float(likely.sum())
         largest = float(np.exp(logsumexp(pool.log_weights))) / (FINAL_POOL * float(PART_SHARES[BASE]))
         design = self.u[: self.n_design][self.f[: self.n_design] <= goal.gamma]
         wide = log_density_ratio(design, isotropic_mixture(self.inputs.dim, self.scales))
-        lineages, none = max(count_lineages(self.failing_batches, wide), 1.0), len(draws.f) == 0
-        if draws.ess < LEAST_ESS:  # what the base draws alone say may be more
+        lineages = max(count_lineages(self.failing_batches, wide), 1.0)
+        if draws.ess < 10:  # what the base draws alone say may be more
             low, high = weighted_interval(draws, goal.confidence, largest, cov)
             most = clopper_pearson(int((of_base <= goal.gamma).sum()), len(of_base), goal.confidence)[1]
         else:
@@ -307,14 +310,16 @@ class SurrogateRun:
             low, high = log_normal_interval(draws.p, cov, goal.confidence, freedom)
         high = max(draws.p, min(add_unseen(draws.p, high, lineages, goal.confidence), most))
         outcome = draws.outcome(goal, status, self.simulator.trace, largest, len(of_base) - self.n_base)
+        contradicted = abs(hits - foreseen) > 4 * math.sqrt(float((likely * (1 - likely)).sum()) + 1)
+        about = f"Kriging foresaw {foreseen:.0f} failures among the final draws, and {hits} failed"
         return replace(
             outcome,
             p=min(draws.p, 1.0),
             interval=(low, min(high, 1.0)),
             cov=cov,
-            status=Status.NO_HITS if status is Status.CONVERGED and none else status,
-            warnings=outcome.warnings if none else _contradict(foreseen, spread, int(hits)),
-            remarks=() if none else outcome.warnings,  # few draws are the rule here, and the interval says it
+            status=Status.NO_HITS if status is Status.CONVERGED and not hits else status,
+            warnings=(f"{about}: it does not describe f.",) * contradicted if hits else outcome.warnings,
+            remarks=outcome.warnings if hits else (),  # few draws are the rule here, and the interval says it
             sample=replace(draws.sample, lineages=lineages),
         )
 
@@ -327,15 +332,6 @@ class SurrogateRun:
         sample = Sample.of_equal_draws(f, self.inputs.base.from_standard_normal(self.u[:n][fails]))
         weights = (DrawWeights.of_equal_draws(n, 0, n),)
         return replace(outcome, counts=None, status=status, sample=sample, draw_weights=weights)
-
-
-def _contradict(foreseen: float, variance: float, hits: int) -> tuple[str, ...]:
-    """Return a warning where the failures among the final draws are not as many as kriging said, by 4 deviations."""
-    if abs(hits - foreseen) <= 4 * math.sqrt(variance + 1):
-        return ()
-    return (
-        f"Kriging foresaw {foreseen:.0f} failures among the final draws, and {hits} failed: it does not describe f.",
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from samplers.components import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, offer_of, request_terms
-from samplers.methods.base import Method, RunContext, SimulationSteps
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, TermsOffer, offer_of, request_terms
+from samplers.methods.base import RunContext, SimulationSteps
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.series import ROUNDS, WALKS
 from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms

@@ -9,10 +9,9 @@ import numpy as np
 
 from samplers.importance import Draws, weight_warnings, weighted_interval
 from samplers.mcmc import RootedPoints
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
 from samplers.methods.base import (
     ComponentDraws,
-    Method,
     RunContext,
     SimulationSteps,
     Simulator,

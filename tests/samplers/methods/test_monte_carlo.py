@@ -6,7 +6,8 @@ import numpy as np
 
 import samplers
 from samplers import method as kept_draws
-from samplers.method import Goal, KeptDraws
+from samplers.method import Goal
+from samplers.methods.monte_carlo import KeptDraws
 
 
 def test_draws_from_the_base_itself():
