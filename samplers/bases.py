@@ -114,18 +114,6 @@ class Gaussian(DrawnByItsMap):
         return np.asarray(self.mean + z @ self.cholesky.T)
 
 
-def gaussian_of_scipy(frozen: Any) -> Gaussian:
-    """Return a frozen `scipy.stats.multivariate_normal`; a ValueError if its covariance is singular."""
-    mean = np.atleast_1d(np.asarray(frozen.mean, dtype=np.float64))
-    rank = int(frozen.cov_object.rank)
-    if rank < len(mean):
-        raise ValueError(
-            f"Expected a multivariate_normal with a covariance of rank {len(mean)}, got rank {rank}: some "
-            "coordinates follow from others; leave these out."
-        )
-    return Gaussian.from_covariance(mean, np.atleast_2d(frozen.cov_object.covariance))
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ScipyDistribution(DrawnByItsMap):
     """Independent coordinates with a continuous distribution of `scipy.stats`, k of them for parameters (k,).
@@ -333,7 +321,13 @@ def convert(base: Any) -> Any:
     if hasattr(base, "freeze") and getattr(base, "numargs", None) == 0:  # of no shape parameters, as a histogram
         base = base.freeze()
     if library.startswith("scipy.stats") and hasattr(base, "cov_object"):
-        return gaussian_of_scipy(base)
+        mean, rank = np.atleast_1d(np.asarray(base.mean, dtype=np.float64)), int(base.cov_object.rank)
+        if rank < len(mean):
+            raise ValueError(
+                f"Expected a multivariate_normal with a covariance of rank {len(mean)}, got rank {rank}: some "
+                "coordinates follow from others; leave these out."
+            )
+        return Gaussian.from_covariance(mean, np.atleast_2d(base.cov_object.covariance))
     frozen = hasattr(base, "ppf") and getattr(base, "dist", None) is not None
     if frozen or (all(hasattr(base, name) for name in ("icdf", "iccdf", "logpdf")) and not isinstance(base, type)):
         return ScipyDistribution(base)

@@ -52,8 +52,6 @@ RATIO_COARSE = "the ratio is imprecise"
 """Words of the warnings that say how imprecise the ratio is, which its interval includes."""
 ROUNDING = 1e-12
 """Share of the largest of three sums of weights below which another is the rounding of a difference."""
-BASE_CHECK_DRAWS = 16
-"""Draws at which the densities of the two base distributions are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -363,27 +361,19 @@ def compare(
         check_whole("max_sim (of A and B together)", max_sim, 2)
     for problem in (a, b):
         check_problem(problem, "dim", "base", "evaluate")
-    _check_same_base(a, b)
+    if int(a.dim) != int(b.dim):
+        raise ValueError(
+            f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions: estimate each by itself."
+        )
+    x = a.base.sample(16, np.random.default_rng(0))
+    if not np.allclose(a.base.log_prob(x), b.base.log_prob(x), rtol=1e-9, atol=1e-9):
+        raise ValueError("Expected two problems with one base distribution, got two densities: estimate each alone.")
     problem = EitherFails(a, b, gamma)
     limit = None if max_sim is None else max_sim // 2
     either = estimate(
         problem, method, gamma, seed, limit, confidence=confidence, progress=progress, ensemble_run=ensemble_run
     )
     return _summarise(either, problem)
-
-
-def _check_same_base(a: Problem, b: Problem) -> None:
-    """Raise a ValueError if the densities of X in the two problems differ at some draws of A's."""
-    if int(a.dim) != int(b.dim):
-        raise ValueError(
-            f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions: estimate each by itself."
-        )
-    x = a.base.sample(BASE_CHECK_DRAWS, np.random.default_rng(0))
-    if not np.allclose(a.base.log_prob(x), b.base.log_prob(x), rtol=1e-9, atol=1e-9):
-        raise ValueError(
-            "Expected two problems with the same base distribution, got two of other densities: estimate each "
-            "by itself."
-        )
 
 
 def _summarise(either: Estimate, problem: EitherFails) -> Comparison:

@@ -63,11 +63,6 @@ class SubspaceGaussian:
     mean: FloatArray  # along the axes, (r,)
     variance: FloatArray  # along the axes, (r,)
 
-    @property
-    def centre(self) -> FloatArray:
-        """Mean, shape (d,)."""
-        return self.axes @ self.mean
-
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the log ratio; it depends on the coordinates along the axes only."""
         t, mean, variance, axis = u @ self.axes, self.mean, self.variance, 1
@@ -215,11 +210,6 @@ class VonMisesFisherNakagami:
     omega: float
 
     @classmethod
-    def standard(cls, dim: int) -> "VonMisesFisherNakagami":
-        """Return N(0, I), but for a concentration that cannot be 0."""
-        return cls(np.eye(dim)[0], LEAST_CONCENTRATION, dim / 2, float(dim))
-
-    @classmethod
     def fit(cls, u: FloatArray, weights: FloatArray) -> "VonMisesFisherNakagami":
         """Fit mean direction, less its length by chance, E[r^2] and E[r^4] of u (n, d) with weights (n,)."""
         weights = weights / weights.sum()
@@ -260,25 +250,22 @@ class VonMisesFisherNakagami:
         m, omega = self.m, self.omega
         nakagami = math.log(2) + m * math.log(m / omega) - float(gammaln(m))
         nakagami = nakagami + (2 * m - 1) * np.log(radius) - m / omega * radius**2
-        fisher = log_normaliser(self.kappa, dim) + self.kappa * ((u @ self.mu) / radius)
+        v, kappa = dim / 2 - 1, self.kappa
+        if v < 50:
+            log_bessel = math.log(float(ive(v, kappa))) + kappa
+        else:  # the asymptotic expansion is exact to 2e-7
+            root = math.hypot(v, kappa)
+            t = v / root
+            series = 1 + (3 * t - 5 * t**3) / (24 * v) + (81 * t**2 - 462 * t**4 + 385 * t**6) / (1152 * v * v)
+            log_root = 0.5 * (LOG_TWO_PI + math.log(root))
+            log_bessel = root + v * math.log(kappa / (v + root)) - log_root + math.log(series)
+        log_constant = v * math.log(kappa) - (v + 1) * LOG_TWO_PI - log_bessel
+        fisher = log_constant + kappa * ((u @ self.mu) / radius)
         return np.asarray(nakagami + fisher - (dim - 1) * np.log(radius))
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
         """Return the log density less that of N(0, I) at u (n, d), shape (n,)."""
         return np.asarray(self.log_prob(u) + 0.5 * (np.einsum("ij,ij->i", u, u) + len(self.mu) * LOG_TWO_PI))
-
-
-def log_normaliser(kappa: float, dim: int) -> float:
-    """Return log kappa^v - log (2 pi)^(v + 1) - log I_v(kappa), v = d / 2 - 1, of the density."""
-    v = dim / 2 - 1
-    if v < 50:
-        log_bessel = math.log(float(ive(v, kappa))) + kappa
-    else:  # the asymptotic expansion is exact to 2e-7
-        root = math.hypot(v, kappa)
-        t = v / root
-        series = 1 + (3 * t - 5 * t**3) / (24 * v) + (81 * t**2 - 462 * t**4 + 385 * t**6) / (1152 * v * v)
-        log_bessel = root + v * math.log(kappa / (v + root)) - 0.5 * (LOG_TWO_PI + math.log(root)) + math.log(series)
-    return v * math.log(kappa) - (v + 1) * LOG_TWO_PI - log_bessel
 
 
 LEAST_VARIANCE = 1e-8

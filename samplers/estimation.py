@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from samplers.analysis.reweight import needs_ensemble_run, pool_refits
+from samplers.analysis.reweight import needs_ensemble_run
 from samplers.bases import find_base_fault
 from samplers.evaluate import Evaluator
 from samplers.executors import AnyExecutor, find_executor
@@ -258,7 +258,8 @@ def add_ensemble_run(
         return first
     further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
     try:
-        inputs = InputsOnly(evaluator.dim, pool_refits(base))
+        mix: Any = base.covering_ensemble if hasattr(base, "covering_ensemble") else base.ensemble
+        inputs = InputsOnly(evaluator.dim, mix())
     except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
         return first
     if read_strata(base) and not read_strata(inputs.base):  # a rare stratum of one density would not be found
@@ -304,16 +305,6 @@ def _follow_chunks(listener: Listener, evaluator: Evaluator, max_sim: int | None
     return show
 
 
-def describe_progress(progress: Progress) -> str:
-    """Return the level and p so far, and with workers their number and what they lost."""
-    words = f"run {progress.run + 1} " if progress.run else ""
-    if not math.isnan(progress.p):
-        words += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
-    if progress.workers:
-        words += f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
-    return words
-
-
 @contextmanager
 def show_bar(max_sim: int | None) -> Iterator[Listener]:
     """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
@@ -328,8 +319,13 @@ def show_bar(max_sim: int | None) -> Iterator[Listener]:
     task = bar.add_task("", total=max_sim, state="", unit="simulations")
 
     def show(progress: Progress) -> None:
-        unit = "done" if progress.workers else "simulations"  # the rest of the line needs the room
-        bar.update(task, completed=progress.n_sim, state=describe_progress(progress), unit=unit)
+        state, unit = f"run {progress.run + 1} " if progress.run else "", "simulations"
+        if not math.isnan(progress.p):
+            state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
+        if progress.workers:
+            state += f", {progress.workers} workers{f', {progress.n_retries} retries' if progress.n_retries else ''}"
+            unit = "done"  # the rest of the line needs the room
+        bar.update(task, completed=progress.n_sim, state=state, unit=unit)
 
     bar.start()
     try:

@@ -390,8 +390,11 @@ class Evaluator:
             if mine:
                 table, notes = self._compute(Request(kind, (np.concatenate([requests[i].x for i in mine]),)))
                 parts = np.split(table, np.cumsum([len(requests[i]) for i in mine])[:-1])
+                threshold, names = notes.get("threshold", self._gamma), tuple(notes.get("names", ()))
                 for i, part in zip(mine, parts, strict=True):
-                    answers[i] = part[:, 0] if kind == "f" else self._read_terms(part, notes)
+                    f, values, ticks = np.split(part, [1, 1 + (part.shape[1] - 1) // 2], axis=1)
+                    at = np.nan_to_num(ticks).astype(np.int64)
+                    answers[i] = f[:, 0] if kind == "f" else Terms(f[:, 0], values, at, threshold, names)
         for i, one in enumerate(requests):
             if one.kind == "gradient":
                 table, notes = self._compute(one)
@@ -401,11 +404,6 @@ class Evaluator:
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f of points x (n, d), shape (n,); NaN if there is no outcome."""
         return self._compute(Request("f", (x,))).table[:, 0]
-
-    def _read_terms(self, table: FloatArray, notes: dict[str, Any]) -> Terms:
-        f, values, ticks = np.split(table, [1, 1 + (table.shape[1] - 1) // 2], axis=1)
-        threshold, names = notes.get("threshold", self._gamma), notes.get("names", ())
-        return Terms(f[:, 0], values, np.nan_to_num(ticks).astype(np.int64), threshold, tuple(names))
 
     def _compute(self, request: Request) -> Result:
         """Return the result of a request, as far as it goes from the journal; NaN if rows have none."""

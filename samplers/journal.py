@@ -113,7 +113,14 @@ class Journal:
     @classmethod
     def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> Journal:
         """Begin a journal in the place of one without finished simulations, or of any (`replace`), that is not open."""
-        if _has_simulations(path) and not replace:
+        try:  # somebody may want to keep what has chunks, or is damaged or of another kind
+            with contextlib.closing(cls.open(path)) as journal:
+                keep = journal.has_simulations
+        except JournalInUse:
+            raise
+        except (FileNotFoundError, JournalError) as error:
+            keep = not isinstance(error, FileNotFoundError | NothingRecorded)
+        if keep and not replace:
             raise JournalError(f"There is a journal already, {str(path)!r}: remove it, or choose another file.")
         _make(path)
         connection = _connect(path)
@@ -152,7 +159,12 @@ class Journal:
                 raise JournalError(f"{str(path)!r} is damaged: its end is missing.") from damage
             if not (mend and damage.number > HEAD):
                 raise
-            _keep_before(path, damage.number)
+            new = path.with_name(f"{path.name}.mended")
+            _make(new)
+            with contextlib.closing(_connect(path)) as damaged, contextlib.closing(_connect(new)) as mended:
+                _fill(mended, itertools.islice(_good_rows(path, damaged), damage.number))
+            _wal(path).unlink(missing_ok=True)
+            os.replace(new, path)
             return cls.open(path)
 
     @property
@@ -321,29 +333,6 @@ def _good_rows(path: Path, connection: sqlite3.Connection) -> Iterator[_Row]:
         raise _Damaged(path, number) from error
     if number == HEAD:
         raise _Damaged(path)
-
-
-def _keep_before(path: Path, number: int) -> None:
-    """Replace a journal by one of its records before a damaged one."""
-    new = path.with_name(f"{path.name}.mended")
-    _make(new)
-    with contextlib.closing(_connect(path)) as damaged, contextlib.closing(_connect(new)) as mended:
-        _fill(mended, itertools.islice(_good_rows(path, damaged), number))
-    _wal(path).unlink(missing_ok=True)
-    os.replace(new, path)
-
-
-def _has_simulations(path: Path) -> bool:
-    """Return whether a file has chunks, or is damaged or of another kind, so that somebody may want to keep it."""
-    try:
-        with contextlib.closing(Journal.open(path)) as journal:
-            return journal.has_simulations
-    except (FileNotFoundError, NothingRecorded):
-        return False
-    except JournalInUse:
-        raise
-    except JournalError:
-        return True
 
 
 def _list_files(path: Path) -> list[Path]:

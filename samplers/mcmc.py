@@ -100,11 +100,6 @@ class Chains(NamedTuple):
         chain, step = np.nonzero(self.used & mask)
         return RootedPoints(self.u[chain, step], self.f[chain, step], self.roots[chain])
 
-    def by_step(self) -> RootedPoints:
-        """Return the used points step by step: the first of every chain, the second of every chain, and so on."""
-        step, chain = np.nonzero(self.used.T)
-        return RootedPoints(self.u[chain, step], self.f[chain, step], self.roots[chain])
-
 
 class RootedPoints(NamedTuple):
     """Points u (n, d), outcomes f (n,) and the index (n,) of the point of level 0 that each descends from."""

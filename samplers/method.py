@@ -517,6 +517,11 @@ class EstimateData(Outcome):
     """Density ratios of the refits at the failing points with what they are of, once they were asked for."""
 
     @property
+    def lineages(self) -> float:
+        """Independent searches that reached failure, see `Sample.lineages`; inf without a search or points."""
+        return math.inf if self.sample is None else self.sample.lineages
+
+    @property
     def choice(self) -> str:
         """Method that `Auto` chose and why, on one line; empty if the method was named."""
         return "" if self.chosen is None else self.chosen.why

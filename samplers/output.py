@@ -46,9 +46,11 @@ _CLASSES: dict[str, type] = {}
 
 
 def to_json_value(value: Any) -> Any:
-    """Return value with None for NaN and infinities inside it, and Python's numbers for those of NumPy."""
-    if isinstance(value, np.generic):
-        value = value.item()
+    """Return value with None for NaN and infinities, dicts for dataclasses, and numbers and lists of Python."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

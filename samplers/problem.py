@@ -441,7 +441,13 @@ class FunctionProblem:
         """Check the arguments; the functions of terms and gradients become those of the protocols."""
         if not (self.f is None or callable(self.f)):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
-        self._set_base()
+        if self.base is None and self.dim == 0:  # as it is where it was not given
+            raise ValueError("Expected dim, a whole number of at least 1, or base, the distribution of x; got neither.")
+        base = StandardNormal(self.dim) if self.base is None else as_distribution(self.base, self.dim or None)
+        object.__setattr__(self, "base", base)
+        if self.dim == 0 and hasattr(base, "dim"):  # a user's distribution need not have it
+            object.__setattr__(self, "dim", int(base.dim))
+        check_whole("dim", self.dim, 1)
         names = self.column_names or getattr(self.base, "column_names", ())
         object.__setattr__(self, "column_names", tuple(names))
         names_of_columns(self)
@@ -454,16 +460,6 @@ class FunctionProblem:
         check_number("gradient_cost", self.gradient_cost, 0.0, math.inf)
         if self.chunk_size is not None:
             check_whole("chunk_size", self.chunk_size, 1)
-
-    def _set_base(self) -> None:
-        """Set the base distribution and the dimension, each of which may follow from the other."""
-        if self.base is None and self.dim == 0:  # as it is where it was not given
-            raise ValueError("Expected dim, a whole number of at least 1, or base, the distribution of x; got neither.")
-        base = StandardNormal(self.dim) if self.base is None else as_distribution(self.base, self.dim or None)
-        object.__setattr__(self, "base", base)
-        if self.dim == 0 and hasattr(base, "dim"):  # a user's distribution need not have it
-            object.__setattr__(self, "dim", int(base.dim))
-        check_whole("dim", self.dim, 1)
 
     def __repr__(self) -> str:
         what = "inputs alone" if self.terms is None else "terms"

@@ -143,6 +143,7 @@ def _fit_mixture_of_size(fit: Fit, u: FloatArray, weights: FloatArray, k: int, r
     # Separate regions of failure lie in separate directions from the origin.
     directions = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     start = start_from_centres(directions, weights, k, rng)
-    terms, least_gain = (lambda mixture: mixture.log_terms(u)), (lambda _: 1e-3)
-    mixture, _ = expectation_maximisation(maximise, terms, start, weights, 50, least_gain)
+    mixture, _ = expectation_maximisation(
+        maximise, lambda mixture: mixture.log_terms(u), start, weights, 50, lambda _: 1e-3
+    )
     return mixture

@@ -470,12 +470,15 @@ def list_facts(
     base, sure = estimate.base_uncertainty, f"{100 * estimate.confidence:g} %"
     if base is not None and base.interval is None and base.bound is None and not left_out:
         left_out = say("error not known", model=model, reason=base.reason)
-    unseen = estimate.unseen
+    unseen, own, ends = estimate.unseen, estimate.sequence or estimate.interval, find_ends(estimate, base)
+    vague = sorted(((p.share * p.interval[1], p.name) for p in estimate.parts if not p.resolved), reverse=True)
+    few = "".join(say("too few failures", name=part, high=format_alike(high)[0]) for high, part in vague[:NAMED_STRATA])
+    few += f"; {len(vague) - NAMED_STRATA} more strata" if len(vague) > NAMED_STRATA else ""
     missed = say("may miss" if unseen < 1 else "may miss anything", unseen=format_alike(unseen)[0], sure=sure)
     rows = {
         name or f"P[f <= {estimate.gamma:g}]": _describe_p(estimate, noun),
         "Given": estimate.given,
-        "Limited by": _describe_limit(estimate, model),
+        "Limited by": describe_limit(estimate.p, own, ends, f"{estimate.n_sim:,}", model, base, few),
         "Left out": left_out,
         "May miss": missed,
     }
@@ -506,17 +509,6 @@ def _describe_p(estimate: Estimate, noun: str) -> str:
 def describe_odds(p: float, noun: str = "") -> str:
     """Return a small p as " (1 in n)", of what `noun` says; empty if it is large, or too small to be read so."""
     return f" (1 in {float(f'{1 / p:.2g}'):,.0f}{noun and f' {noun}'})" if LEAST_ODDS < p < 0.1 else ""
-
-
-def _describe_limit(estimate: Estimate, model: str) -> str:
-    """Return whether the events behind the base distribution or the simulations make the interval as wide as it is."""
-    base, n, vague = estimate.base_uncertainty, f"{estimate.n_sim:,}", [p for p in estimate.parts if not p.resolved]
-    highest = sorted(((part.share * part.interval[1], part.name) for part in vague), reverse=True)
-    named = highest[:NAMED_STRATA]
-    few = "".join(say("too few failures", name=part, high=format_alike(high)[0]) for high, part in named)
-    few += f"; {len(highest) - NAMED_STRATA} more strata" if len(highest) > NAMED_STRATA else ""
-    own, ends = estimate.sequence or estimate.interval, find_ends(estimate, base)
-    return describe_limit(estimate.p, own, ends, n, model, base, few)
 
 
 def describe_limit(

@@ -373,15 +373,16 @@ class Run:
         if self._on_error != "bound":
             return low, high
         if outcome.parts:
-            return find_low_end([replace(part, outcome=self._keep_known(part.outcome)) for part in outcome.parts]), high
+            found = ((part, part.outcome) for part in outcome.parts)
+            known_parts = [
+                replace(one, outcome=replace(of, p=of.p * (1 - of.no_outcome_share), interval=self._find_ends(of)))
+                for one, of in found
+            ]
+            return find_low_end(known_parts), high
         if outcome.counts is None:
             return estimate_known(outcome, self._goal.gamma, self._goal.confidence)[2] if outcome.p > 0 else low, high
         hits, n = outcome.counts
         return clopper_pearson(round(hits * known), n, self._goal.confidence)[0], high
-
-    def _keep_known(self, outcome: Outcome) -> Outcome:
-        """Return the outcome of a part with p and the lower limit of the failures that have an outcome."""
-        return replace(outcome, p=outcome.p * (1 - outcome.no_outcome_share), interval=self._find_ends(outcome))
 
     def _find_sequence(self, whole: Outcome, interval: Interval) -> Interval | None:
         """Return the ends that hold at every look, around the interval; None if the run stops on nothing seen."""

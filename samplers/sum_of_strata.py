@@ -57,10 +57,6 @@ from samplers.replicate import (
 )
 from samplers.sample import Level, Status, clopper_pearson
 
-PILOT_SHARE = 0.25
-"""Share of max_sim for the pilots."""
-FEWEST = 20
-"""Simulations for each stratum up to which there are no pilots: all are made at once, in equal parts."""
 PILOT_DRAWS = 1000
 """Draws of a pilot of plain draws if there is no max_sim."""
 OFTEN = 0.004
@@ -74,15 +70,9 @@ may meet nothing where plain draws do: as what met a failure counts, p would be 
 100 simulations."""
 PILOT_COV = 0.3
 """C.o.v. at which pilots stop if there is a target; a larger target takes its place."""
-MARGIN = 0.9
-"""Part of a target c.o.v. that a stratum is given: the sum's own p is not yet known."""
-MOST_ROUNDS = 6
-"""Rounds of runs for a target, pilots aside."""
 PLENTY = 6000
 """Simulations for the search of a stratum whose pilot resolved nothing; further ones are plain draws, which all count
 in its upper limit."""
-LEAST_GAIN = 0.1
-"""Plain draws are made where they are more than this part of the simulations made."""
 
 
 @dataclass(frozen=True)
@@ -137,12 +127,15 @@ class _Sum:
                 if not self.stopped:
                     yield from self._run(*task)
             rounds += 1
-            most = 1 + self.chooses if self.goal.target_cov is None else MOST_ROUNDS
+            most = 1 + self.chooses if self.goal.target_cov is None else 6
             more = not self.stopped and rounds <= most
             tasks = (self._plan_searches() if self.chooses and rounds == 1 else self._plan_more()) if more else []
-        for task in self._plan_plain_draws():
-            if not self.stopped:
-                yield from self._run(*task)
+        n = self.plain_draws if self.most is None else self.most - self.n_sim
+        empty = [i for i in range(len(self.parts)) if self._is_unresolved(i)]
+        sizes = [int(n * self.parts[i].share / sum(self.parts[k].share for k in empty)) for i in empty]
+        for i, size in zip(empty, sizes, strict=True):
+            if not self.stopped and size > 0.1 * self.parts[i].n_sim:  # a tenth of the simulations made
+                yield from self._run(i, size, None, MonteCarlo())
         whole = sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
         for last in self.trace[-1:]:  # levels of a run do not know the pilot
             self.goal.on_level(replace(last, estimate=whole.p))
@@ -155,8 +148,8 @@ class _Sum:
         method = MonteCarlo() if self.chooses else None
         if n is None:
             return [(i, PILOT_DRAWS if self.chooses else None, target, method) for i in range(k)]
-        few = n < FEWEST * k
-        sizes = np.full(k, n // k if few else int(PILOT_SHARE * n) // k)
+        few = n < 20 * k  # no pilots: all are made at once, in equal parts
+        sizes = np.full(k, n // k if few else int(0.25 * n) // k)
         if few:
             sizes[np.argsort([-part.share for part in self.parts], kind="stable")[: n % k]] += 1
         return [(i, int(size), target, method) for i, size in enumerate(sizes) if size]
@@ -167,7 +160,7 @@ class _Sum:
         use, targets = np.full(k, True), [target] * k
         if target is not None and whole.p > 0:
             for i, part in enumerate(whole.parts):
-                targets[i] = MARGIN * (limit := target / math.sqrt(part.of_sum or 1.0))
+                targets[i] = 0.9 * (limit := target / math.sqrt(part.of_sum or 1.0))  # the sum's own p is not yet known
                 late = part.p > 0 and part.cov > limit and whole.cov > target
                 may_add_most = not part.resolved and part.share * part.interval[1] > whole.p
                 use[i] = i not in self.at_limit and (late or may_add_most)
@@ -214,29 +207,18 @@ class _Sum:
         in_vain = stratum in self.searched and (drawn or self._is_unresolved(stratum))
         return MonteCarlo() if self.chooses and (self._fails_often(stratum) or in_vain) else None
 
-    def _has_draws_next(self, stratum: int) -> bool:
-        """Return whether plain draws come next in a stratum that is not resolved: all count in its upper limit."""
-        return self._is_unresolved(stratum) and self._find_method(stratum) is not None
-
     def _is_unresolved(self, stratum: int) -> bool:
         """Return whether simulations of a stratum have met no failure, or too few to say how likely they are."""
         part = self.parts[stratum]
         return part.n_sim > 0 and not is_resolved(part.outcome)
-
-    def _plan_plain_draws(self) -> list[Task]:
-        """Return plain draws for the strata that are not resolved, of the simulations left by their shares."""
-        n = self.plain_draws if self.most is None else self.most - self.n_sim
-        empty = [i for i in range(len(self.parts)) if self._is_unresolved(i)]
-        whole = sum(self.parts[i].share for i in empty)
-        drawn = [(i, int(n * self.parts[i].share / whole)) for i in empty]
-        return [(i, size, None, MonteCarlo()) for i, size in drawn if size > LEAST_GAIN * self.parts[i].n_sim]
 
     def _allocate(self, use: NDArray[np.bool_], parts: Sequence[Part]) -> FloatArray:
         """Return how many of the simulations left each stratum gets, (k,), of those in use."""
         widths = [part.share * (part.interval[1] - part.interval[0]) for part in parts]
         need = np.sqrt(np.maximum(self.behind, 1.0)) * widths
         # a new run takes the place of the one before, and a smaller one is worse; draws are added to those before
-        adds = [p.outcome.counts is not None or self._has_draws_next(i) for i, p in enumerate(parts)]
+        draws_next = [self._is_unresolved(i) and self._find_method(i) is not None for i in range(len(parts))]
+        adds = [part.outcome.counts is not None or draws for part, draws in zip(parts, draws_next, strict=True)]
         least = np.where(adds, 0.0, self.behind)
         sizes = np.zeros(len(parts))
         while use.any():

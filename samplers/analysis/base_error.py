@@ -44,13 +44,7 @@ from samplers.analysis.reweight import (
     reweight_runs_to_refits,
     split_families,
 )
-from samplers.analysis.weighted import (
-    Reported,
-    band_generator,
-    estimate_known,
-    require_sample,
-    simultaneous_level,
-)
+from samplers.analysis.weighted import Reported, estimate_known, require_sample, simultaneous_level
 from samplers.method import EstimateData
 from samplers.output import format_alike, say
 from samplers.problem import FloatArray
@@ -59,8 +53,6 @@ from samplers.sample import Interval
 FIT_BIAS = 0.2
 """Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: it
 keeps the interval of thousands of events from being too narrow, and is nothing beside the spread at 38."""
-MAX_SPREAD = 2.0
-"""Standard deviation of log p_b above which the events do not determine p."""
 MIN_REFITS = 2
 """Refits, and clusters of events, from which there is a spread at all."""
 NO_SUMS = RefitSums(np.empty((1, 0)), np.empty((1, 0)))
@@ -161,7 +153,7 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
         fitted,
         sums,
         sampling=estimate.interval,
-        lineages=read_lineages(estimate),
+        lineages=estimate.lineages,
         n_sim=0 if further is None else further.n_sim,
         doubts=[] if further is None else [f"in the further run: {text}" for text in further.warnings],
         reason=reason,
@@ -171,15 +163,11 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
     p, cov, _ = estimate_known(estimate, estimate.gamma, estimate.confidence)
     known = None
     if p > 0:
-        sums = reweight_runs_to_refits(estimate, fitted.refits, keep_known)
+        sums = reweight_runs_to_refits(
+            estimate, fitted.refits, lambda run: np.isfinite((s := require_sample(run)).f[s.f <= run.gamma])[None] * 1.0
+        )
         known = summarise_refits(p, cov, estimate.confidence, fitted, sums, sampling=estimate.interval).interval
     return replace(found, interval=(0.0 if known is None else known[0], found.interval[1]))
-
-
-def keep_known(run: EstimateData) -> FloatArray:
-    """Return 1 for the failing points of a run that have an outcome, 0 for the others, shape (1, k)."""
-    sample = require_sample(run)
-    return np.isfinite(sample.f[sample.f <= run.gamma]).astype(np.float64)[None]
 
 
 def summarise_refits(
@@ -217,7 +205,7 @@ def summarise_refits(
         if sampling is not None:
             low, high = min(low, sampling[0]), max(high, sampling[1])
         spread = float(log_values.std(ddof=1))
-        if spread <= MAX_SPREAD:
+        if spread <= 2.0:  # above, the events do not determine p
             interval, expected = (low, high), None if is_ratio else expect_over_families(families, largest)
         elif is_ratio:
             few = say("too few events", what="limits of the ratio")
@@ -260,11 +248,6 @@ def _explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
 def _exp(exponent: float) -> float:
     """Return exp(exponent); inf if that is no float."""
     return math.exp(exponent) if exponent < math.log(np.finfo(np.float64).max) else math.inf
-
-
-def read_lineages(estimate: EstimateData) -> float:
-    """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
-    return math.inf if estimate.sample is None else estimate.sample.lineages
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -319,8 +302,12 @@ def compute_refit_band(
     known = [i for i in range(len(p)) if p[i] > 0 and not _explain_missing_spread(sums.log_p[i], fitted.clusters)]
     low, high, spread = np.zeros(len(p)), np.ones(len(p)), np.full(len(p), np.nan)
     if known:
-        errors = _correlate_errors(cov[known], correlation[np.ix_(known, known)], sums.log_p[known], fitted)
-        level = simultaneous_level(errors, confidence, band_generator(seed))
+        families = read_refit_families(fitted, sums.log_p.shape[1])
+        deviations, freedom = deviate_within_families(sums.log_p[known], families)
+        sampling = np.outer(cov[known], cov[known]) * correlation[np.ix_(known, known)]
+        covariance = deviations @ deviations.T / freedom + sampling + FIT_BIAS**2
+        scale = 1 / np.sqrt(np.diag(covariance))
+        level = simultaneous_level(np.asarray(covariance * np.outer(scale, scale)), confidence, seed)
     for i in known:
         values = RefitSums(sums.log_p[i : i + 1], sums.ess[i : i + 1])
         found = summarise_refits(float(p[i]), float(cov[i]), level, fitted, values, lineages=lineages)
@@ -338,11 +325,3 @@ def compute_refit_band(
         fitted_to=fitted.fitted_to,
         family=fitted.family,
     )
-
-
-def _correlate_errors(cov: FloatArray, correlation: FloatArray, log_p: FloatArray, fitted: FittedBase) -> FloatArray:
-    """Return the correlation of the errors of log p at k thresholds, shape (k, k); log_p of R refits is (k, R)."""
-    deviations, freedom = deviate_within_families(log_p, read_refit_families(fitted, log_p.shape[1]))
-    covariance = deviations @ deviations.T / freedom + np.outer(cov, cov) * correlation + FIT_BIAS**2
-    scale = 1 / np.sqrt(np.diag(covariance))
-    return np.asarray(covariance * np.outer(scale, scale))

@@ -18,12 +18,7 @@ from samplers.analysis.weighted import (
     unit_sums,
 )
 from samplers.method import EstimateData
-from samplers.output import (
-    Kept,
-    drawing_axes,
-    register_stored,
-    to_json_value,
-)
+from samplers.output import Kept, drawing_axes, register_stored, to_json_value
 from samplers.problem import FloatArray, needs_library
 from samplers.sample import Sample, add_unseen
 
@@ -89,7 +84,7 @@ class Curve(Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON; infinities become None."""
-        data = {name: to_json_value(values.tolist()) for name, values in self._columns().items()}
+        data: dict[str, Any] = to_json_value(self._columns())
         return {**data, "confidence": self.confidence}
 
     def to_arrow(self) -> "pyarrow.Table":
@@ -158,7 +153,10 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     grid, place = np.unique(np.append(asked, estimate.gamma), return_inverse=True)
     sums, at_gamma = unit_sums(sample, grid), int(place[-1])
     use = np.unique(place[:-1])
-    p = _anchor_at_estimate(estimate, sums.p, at_gamma)
+    own, p = float(sums.p[at_gamma]), sums.p
+    if own > 0 and not math.isclose(own, estimate.p, rel_tol=1e-9):
+        p = p + (estimate.p / own - 1) * np.minimum(p, own)
+    p = np.minimum(p, 1.0)
     inflation = cov_inflation(estimate, float(sums.cov[at_gamma]))
     cov = np.where(sums.is_count, 1.0, inflation) * sums.cov
     low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
@@ -173,16 +171,9 @@ def compute_curve(estimate: EstimateData, gammas: ArrayLike) -> Curve:
     ]
     high[use] = add_unresolved(estimate, grid[use], p[use], high[use])
     high[use] = np.minimum.accumulate(high[use][::-1])[::-1]
-    here = place[:-1]
-    return Curve(
-        gammas=asked,
-        p=p[here],
-        low=low[here],
-        high=high[here],
-        cov=cov[here],
-        ess=sums.ess[here],
-        confidence=estimate.confidence,
-    )
+    found = {"p": p, "low": low, "high": high, "cov": cov, "ess": sums.ess}
+    columns = {name: values[place[:-1]] for name, values in found.items()}
+    return Curve(gammas=asked, **columns, confidence=estimate.confidence)
 
 
 def as_thresholds(gammas: ArrayLike) -> FloatArray:
@@ -225,12 +216,3 @@ def lowest_known_threshold(sample: Sample, gamma: float) -> float:
     start = float(sample.f[rising][np.argmax(enough)]) if enough.any() else math.inf
     start = max(start, float(np.finfo(np.float64).min))  # points without an outcome count at any threshold
     return min(start, gamma) if (sample.weights[sample.f <= gamma] > 0).any() else start
-
-
-def _anchor_at_estimate(estimate: EstimateData, sums: FloatArray, at_gamma: int) -> FloatArray:
-    """Return the sums (G,) at rising thresholds, moved so that they equal the estimate at gamma, and cut at 1."""
-    own = float(sums[at_gamma])
-    if own == 0 or math.isclose(own, estimate.p, rel_tol=1e-9):
-        return np.minimum(sums, 1.0)
-    moved = sums + (estimate.p / own - 1) * np.minimum(sums, own)
-    return np.asarray(np.minimum(moved, 1.0))

@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.base_error import (
-    NO_SUMS,
-    BaseUncertainty,
-    RefitBand,
-    compute_refit_band,
-    read_lineages,
-    summarise_refits,
-)
+from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, RefitBand, compute_refit_band, summarise_refits
 from samplers.analysis.curve import Curve, as_thresholds
 from samplers.analysis.reweight import FittedBase, RefitSums, choose_better_run, find_fitted_base, reweight_to_refits
 from samplers.analysis.weighted import (
@@ -161,7 +154,7 @@ def expect_under_refits(
         fitted,
         sums,
         sampling=expectation.interval,
-        lineages=read_lineages(estimate),
+        lineages=estimate.lineages,
         largest=largest,
         n_sim=0 if further is None or estimate.ensemble_run is None else estimate.ensemble_run.n_sim,
         reason=reason,
@@ -292,19 +285,12 @@ def compute_exceedance(
     terms = (failures.weights * (f <= grid[i]) for i in use)
     high[use] = [failures.add_missed(own, end, estimate.confidence) for own, end in zip(terms, high[use], strict=True)]
     high = np.minimum.accumulate(high[::-1])[::-1]
-    here = place[:-1]
-    enough = np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)
+    here, enough = place[:-1], np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)
     sampling = enough[here], cov[here], sums.correlation[np.ix_(here, here)]
-    return Exceedance(
-        gammas=asked,
-        p=sums.p[here],
-        low=low[here],
-        high=high[here],
-        cov=cov[here],
-        ess=sums.ess[here],
-        confidence=estimate.confidence,
-        base=_band_under_refits(estimate, (failures, v), further, asked, sampling),
-    )
+    base = _band_under_refits(estimate, (failures, v), further, asked, sampling)
+    found = {"p": sums.p, "low": low, "high": high, "cov": cov, "ess": sums.ess}
+    columns = {name: values[here] for name, values in found.items()}
+    return Exceedance(gammas=asked, **columns, confidence=estimate.confidence, base=base)
 
 
 def _band_under_refits(
@@ -330,13 +316,6 @@ def _band_under_refits(
         sums = _sum_parts_under_refits(estimate, fitted, beyond)
     except ValueError:  # p itself is not known under the refits, as `BaseUncertainty` says
         return None
-    band = compute_refit_band(
-        thresholds,
-        *sampling,
-        sums,
-        fitted,
-        confidence=estimate.confidence,
-        seed=estimate.seed,
-        lineages=read_lineages(estimate),
-    )
+    about: dict[str, Any] = {"seed": estimate.seed, "lineages": estimate.lineages}
+    band = compute_refit_band(thresholds, *sampling, sums, fitted, confidence=estimate.confidence, **about)
     return band if np.isfinite(band.spread).any() else None

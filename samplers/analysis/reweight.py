@@ -44,19 +44,8 @@ MAX_LOG = 600.0
 """exp of this, or of its negative, is still a float."""
 SUPPORT_DRAWS = 10_000
 """Draws from the new base that are checked for a density of 0 under the old one."""
-MIN_REFIT_ESS = 10.0
-"""Effective failing points from which p under a refit has an error of about 0.3 in its logarithm: little beside the
-usual spread of the refits, 0.7 to 1.5."""
-MIN_OWN_ESS = 30.0
-"""Effective failing points under the own base from which a lack of points is the refits' and not that of the budget."""
-MAX_UNCOVERED_SHARE = 0.1
-"""Share of the refits that may rest on fewer points than that."""
 REFIT_CHECK_DRAWS = 100
 """Draws on which a refit is compared with its base before the first simulation."""
-MIN_FAMILY_SHARE = 0.05
-"""Share of the refits from which a family has an interval of its own: one that fewer choose is not plausible."""
-MIN_FAMILY = 10
-"""Refits from which a family has a spread of its own; smaller families take the pooled one."""
 
 
 @runtime_checkable
@@ -154,7 +143,9 @@ def reweight_estimate(estimate: EstimateData, new_base: Any) -> Reweighted:
         new_base = base.sibling(new_base)
     if isinstance(new_base, list | tuple) or convert(new_base) is not None:
         new_base = as_distribution(new_base, sample.x.shape[1])
-    _check_strata(estimate.base, new_base)
+    strata, new = ([s.name for s in getattr(one, "strata", None) or ()] for one in (estimate.base, new_base))
+    if strata and new and strata != new:
+        raise ValueError(f"Expected a base with the strata {', '.join(strata)}, in this order; got {', '.join(new)}.")
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
     log_ratios = _log_density_ratios(estimate, new_base, sample.x)
@@ -203,13 +194,6 @@ def _spread_of_units(terms: FloatArray, owners: NDArray[np.int64], n_units: int)
     if units == 0:
         return 0.0, math.inf
     return units, math.sqrt(max(1 / units - 1 / n_units + float(totals.max() / totals.sum()) ** 2, 0.0))
-
-
-def _check_strata(base: object, new_base: object) -> None:
-    """Raise a ValueError where both bases have strata, but not the same ones in the same order."""
-    old, new = ([each.name for each in getattr(one, "strata", None) or ()] for one in (base, new_base))
-    if old and new and old != new:
-        raise ValueError(f"Expected a base with the strata {', '.join(old)}, in this order; got {', '.join(new)}.")
 
 
 def require_base(estimate: EstimateData) -> Distribution:
@@ -393,16 +377,12 @@ def choose_better_run(found: Sequence[RefitSums], points: Sequence[FloatArray] |
 
 
 def count_uncovered(ess: FloatArray) -> int:
-    """Return how many of R refits rest on too few effective failing points, ess (R,); 0 if no more than a tenth."""
-    few = int(np.count_nonzero(ess < MIN_REFIT_ESS))
-    return few if few > MAX_UNCOVERED_SHARE * len(ess) else 0
+    """Return how many of R refits rest on under 10 effective failing points, ess (R,); 0 if no more than a tenth.
 
-
-def pool_refits(base: Any) -> Distribution:
-    """Return the mixture of refits that a further run simulates under; a ValueError if the base cannot mix them."""
-    mix = base.covering_ensemble if hasattr(base, "covering_ensemble") else base.ensemble
-    mixture: Distribution = mix()
-    return mixture
+    From 10 on log p has an error of about 0.3: little beside the usual spread of the refits, 0.7 to 1.5.
+    """
+    few = int(np.count_nonzero(ess < 10))
+    return few if few > 0.1 * len(ess) else 0
 
 
 def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:
@@ -417,7 +397,7 @@ def needs_ensemble_run(estimate: EstimateData, split: Callable[[FloatArray], Flo
         return False
     try:
         parts = None if split is None else split(sample.x)
-        if _sum_parts(estimate, sample, np.zeros((1, len(sample.x))), parts).ess.min() < MIN_OWN_ESS:
+        if _sum_parts(estimate, sample, np.zeros((1, len(sample.x))), parts).ess.min() < 30:
             return False
         sums = _sum_parts(estimate, sample, refit_log_ratios(estimate, sample, fitted.refits), parts)
     except ValueError:  # no points to reweight: the mixture of the refits would not mend that
@@ -458,7 +438,7 @@ def split_families(log_p: float, log_values: FloatArray, family_of: NDArray[np.i
     for name in sorted({0, *family_of.tolist()}):
         own = log_values[family_of == name]
         centre = log_p if name == 0 else float(own.mean())
-        variance, freedom = (float(own.var(ddof=1)), len(own) - 1) if len(own) >= MIN_FAMILY else (pooled, free)
+        variance, freedom = (float(own.var(ddof=1)), len(own) - 1) if len(own) >= 10 else (pooled, free)
         families.append(RefitFamily(centre, variance, freedom, len(own) / len(log_values)))
     return tuple(families)
 
@@ -481,7 +461,7 @@ def find_log_ends(
     """
     ends = []
     for number, family in enumerate(families):
-        if number == 0 or family.share >= MIN_FAMILY_SHARE:
+        if number == 0 or family.share >= 0.05:
             quantile = refit_quantile(confidence, family.freedom, clusters)
             half = quantile * math.sqrt(family.variance + other_variance)
             ends.append((family.centre - half, family.centre + raise_log_end(half, lineages, confidence)))

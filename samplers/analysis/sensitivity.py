@@ -60,21 +60,11 @@ from samplers.sample import effective_number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ROUNDING_VARIANCE = 1e-12
-"""Of u_j given failure: below it points are equal but for rounding."""
 DIFFERENCE_STEP = 1e-4
 """Step of the central difference over the change for which a sensitivity is stated: its error is of order 1e-8 of the
 third derivative, and rounding of log_prob of order 1e-12."""
-MIN_ALIGNED_REFITS = 10
-"""Refits with the parameters of the base that shares of the spread must rest on."""
 JOINT_GROUP = "weights of components"
 """Group of parameters that are about all columns."""
-MIN_CORRELATION = 0.8
-"""Correlation of log p to first order with log p over the refits below which no recording is recommended."""
-ENOUGH_POINTS = 30.0
-"""Effective failing points below which importance and derivatives are called not determined."""
-RECOMBINED = 20
-"""Failing points whose columns are exchanged to see whether they are correlated."""
 SHOWN_PARAMETERS = 12
 """Rows of the table for people, and bars of the picture."""
 
@@ -170,7 +160,7 @@ class Sensitivity(Reported):
             f"{'  ' + each.name:<{width}} {each.importance:8.3f} +- {each.error:.3f} {each.direction:+7.2f} sd"
             for each in self.columns[:SHOWN_PARAMETERS]
         ]
-        if self.points < ENOUGH_POINTS:
+        if self.points < 30:
             lines.append(f"only {self.points:.0f} effective failing points, too few for importance and derivatives")
         if shown:
             lines.append(f"{head:<{width}} {'change':>8} {'d log p':>9}    error" + ("   share" if self.shares else ""))
@@ -193,7 +183,7 @@ class Sensitivity(Reported):
         if min(self.shares.values()) < 0:
             lines.append("a negative share: in the refits it varies against others, and narrows the spread of p")
         name = next(iter(self.shares))
-        if not self.correlation or self.correlation < MIN_CORRELATION:
+        if not self.correlation or self.correlation < 0.8:
             lines.append("first order describes the refits poorly: these shares are rough")
         elif name != JOINT_GROUP:
             lines.append(f"more recordings of {name} would narrow the interval most")
@@ -229,7 +219,7 @@ def compute_sensitivity(
         raise ValueError(f"Expected names and sizes of {dim} columns, got {len(names)} names and sizes {sizes}.")
     points = effective_number(failures.unit_totals(failures.weights))
     columns = _rank_columns(failures, base, names, sizes, points)
-    found = Sensitivity(columns=columns, points=points, conditional=_is_correlated(base, failures.x[:RECOMBINED]))
+    found = Sensitivity(columns=columns, points=points, conditional=_is_correlated(base, failures.x[:20]))
     if not by_parameters:
         return found
     labels = [
@@ -272,7 +262,7 @@ def _rank_columns(
     u = np.asarray(base.to_standard_normal(failures.x), dtype=np.float64)
     share = failures.weights / failures.weights.sum()
     mean, square = share @ u, share @ u**2
-    variance = np.maximum(square - mean**2, ROUNDING_VARIANCE)
+    variance = np.maximum(square - mean**2, 1e-12)  # below, points are equal but for rounding
     entropy = (square - 1 - np.log(variance)) / 2 - 1 / points
     influence = (1 - 1 / variance) / 2 * (u**2 - square) + mean / variance * (u - mean)
     total = -math.log(float(failures.weights.sum()))
@@ -329,7 +319,7 @@ def _share_spread(
         return None, {"reason": "the base distribution has no refits, so that no share of a spread is known"}
     displacements, used = _refit_displacements(base, fitted.refits, labels)
     about: dict[str, Any] = {"n_refits": (len(used), len(fitted.refits))}
-    if len(used) < MIN_ALIGNED_REFITS:
+    if len(used) < 10:
         few = f"only {len(used)} of {len(fitted.refits)} refits"
         return None, {**about, "reason": f"{few} have the parameters of the base, so that no share is known"}
     log_p = reweight_to_refits(estimate, fitted.refits).log_p[0, used]

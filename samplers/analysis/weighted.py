@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,6 @@ from samplers.sample import (
 MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t
 interval."""
-EIGENVALUE_ROUNDING = 1e-10
-"""Eigenvalues of a G x G correlation up to G times this are rounding: its trace is G."""
-BAND_DRAWS = 10_000
-"""Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
-BAND_STREAM = 2**31
-"""Spawn key of the generator for these draws; the runs have 0, 1, 2, ..."""
 NO_OUTCOME_LABEL = "no outcome"
 """Label of points on which f raised or gave NaN and that were counted as failing."""
 
@@ -53,8 +47,7 @@ class Reported:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON; NaN and infinities become None."""
-        values = asdict(self)
-        return {name: to_json_value(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
+        return cast(dict[str, Any], to_json_value(self))
 
 
 def require_sample(estimate: EstimateData) -> Sample:
@@ -97,23 +90,13 @@ def add_unresolved(
 
 
 def find_missed(
-    parts: Sequence[Part],
-    units: NDArray[np.int64],
-    weights: FloatArray,
-    terms: FloatArray,
-    confidence: float,
+    parts: Sequence[Part], units: NDArray[np.int64], weights: FloatArray, terms: FloatArray, confidence: float
 ) -> tuple[float, list[str]]:
     """Return how much strata may add to a kind of failure that they hardly showed, and their names; 0 without strata.
 
     That is the root of the sum of (w_k h_k s_k)^2, h_k the upper limit of p_k, s_k the bound of a share that none of
-    the effective failing draws of the stratum had (1 if p_k is not resolved).
-
-    Args:
-        parts: Of the estimate.
-        units: Independent units of the failing points, (k,).
-        weights: Their weights, (k,).
-        terms: The weights as the kind has them, 0 at points of other kinds, (k,).
-        confidence: Of h_k and s_k.
+    the effective failing draws of the stratum had (1 if p_k is not resolved). Failing points are of these units and
+    have these weights, (k,) each; `terms` (k,) are the weights as the kind has them, 0 at points of other kinds.
     """
     squares, names, first = 0.0, list[str](), 0
     for part in parts:
@@ -241,7 +224,7 @@ def simultaneous_intervals(
 
     They are 0 and 1 but at the thresholds with the indices `use`; exact where p is a share of plain draws.
     """
-    level = simultaneous_level(sums.correlation[np.ix_(use, use)], confidence, band_generator(seed))
+    level = simultaneous_level(sums.correlation[np.ix_(use, use)], confidence, seed)
     low, high = np.zeros(len(p)), np.ones(len(p))
     for i in use:
         if sums.is_count[i]:
@@ -251,22 +234,19 @@ def simultaneous_intervals(
     return low, high
 
 
-def band_generator(seed: int) -> np.random.Generator:
-    """Return the generator of the draws for a band of a run with this seed."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(BAND_STREAM,)))
-
-
-def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:
+def simultaneous_level(correlation: NDArray[np.float64], confidence: float, seed: int) -> float:
     """Return the level of pointwise intervals that together hold with probability `confidence`.
 
-    `correlation` is that of the estimates, shape (G, G), with rows of zeros for those that do not vary.
+    `correlation` is that of the estimates, shape (G, G), with rows of zeros for those that do not vary; the seed is
+    that of the run. The 95 % quantile of 10,000 draws of the largest deviation is good to about 1 %.
     """
     values, vectors = np.linalg.eigh(correlation)
-    some = values > EIGENVALUE_ROUNDING * max(len(values), 1)
+    some = values > 1e-10 * max(len(values), 1)  # less is rounding: the trace is G
     if np.count_nonzero(some) <= 1:
         return confidence
     roots = vectors[:, some] * np.sqrt(values[some])
-    largest = np.abs(rng.standard_normal((BAND_DRAWS, roots.shape[1])) @ roots.T).max(axis=1)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))  # the runs have 0, 1, 2, ...
+    largest = np.abs(rng.standard_normal((10_000, roots.shape[1])) @ roots.T).max(axis=1)
     level = 1 - 2 * float(ndtr(-np.quantile(largest, confidence)))
     return max(level, confidence)
 

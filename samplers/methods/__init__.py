@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pkgutil import resolve_name
 from typing import Any, ClassVar, cast
 
@@ -164,7 +164,10 @@ class Methods(Mapping[str, type[Stepping]]):
             try:
                 if entry.name in loaded:
                     raise ValueError("that name is taken")
-                loaded[entry.name] = _load_method(entry)
+                found = _check_class(entry.load())
+                if found.name != entry.name:
+                    raise ValueError(f"the class {found.__name__} is named {found.name!r}, not as its entry point")
+                loaded[entry.name] = found
             except Exception as error:  # an error of another package must not break this one
                 package = "" if entry.dist is None else f" of {entry.dist.name}"
                 what = f"The method {entry.name!r}{package} ({entry.value}) cannot be used"
@@ -209,28 +212,24 @@ def get_method(name: str, **settings: Any) -> Stepping:
     """
     if not isinstance(name, str) or (":" not in name and name not in METHODS):
         check_name("method", name, [*METHODS, "module:Class"])
-    found = _import_method(name) if ":" in name else METHODS[name]
+    found: Any = METHODS[name] if ":" not in name else None
+    try:
+        found = found or resolve_name(name)
+        found = found if isinstance(found, Stepping) and not isinstance(found, type) else _check_class(found)
+    except Exception as error:  # the module is the user's: anything may happen in it
+        raise ValueError(f"Cannot use the method {name!r}: {_describe(error)}.") from error
     cls = found if isinstance(found, type) else type(found)
     for setting in settings:
         check_name(f"setting of {cls.__name__}", setting, list(inspect.signature(cls).parameters))
     if not isinstance(found, type):
-        return replace(cast(Any, found), **settings) if settings else found
+        return cast(Stepping, replace(found, **settings) if settings else found)
     try:
-        return cls(**settings)
+        return cast(Stepping, cls(**settings))
     except ValueError:
         raise
     except Exception as error:  # of a user's class
         hint = f"if it needs settings, name an object that has them, as tuned = {cls.__name__}(...) in its module"
         raise ValueError(f"Cannot make the method {name!r}: {_describe(error)}; {hint}.") from error
-
-
-def _import_method(place: str) -> type[Stepping] | Stepping:
-    """Return the class or object in a place module:name."""
-    try:
-        found = resolve_name(place)
-        return found if isinstance(found, Stepping) and not isinstance(found, type) else _check_class(found)
-    except Exception as error:  # the module is the user's: anything may happen in it
-        raise ValueError(f"Cannot use the method {place!r}: {_describe(error)}.") from error
 
 
 def _describe(error: Exception) -> str:
@@ -246,11 +245,3 @@ def _check_class(cls: Any) -> type[Stepping]:
     if missing:
         raise TypeError(f"the class {cls.__name__} has no {', '.join(missing)}")
     return cast(type[Stepping], cls)
-
-
-def _load_method(entry: EntryPoint) -> type[Stepping]:
-    """Import the class that an entry point names."""
-    found = _check_class(entry.load())
-    if found.name != entry.name:
-        raise ValueError(f"the class {found.__name__} is named {found.name!r}, its entry point {entry.name!r}")
-    return found

@@ -93,7 +93,13 @@ class ImportanceSampling(Method):
         """Search for the tilt, then draw until the interval is narrow enough."""
         search = Search(inputs, goal, rng)
         tilt = yield from self._search(search, inputs.dim)
-        missed = unreached_share(search, tilt.mean) if tilt and search.status is not Status.STOPPED else 0.0
+        missed = 0.0
+        if tilt and search.status is not Status.STOPPED:  # base draws under the first level behind the origin, or ...
+            first, theta, failing = search.rounds[0], tilt.mean, search.failing_points()
+            missed = float((first.u[first.f <= search.trace[0].gamma] @ theta < 0).mean())
+            if len(failing):  # ... failing mass where the tilted density is under the base density
+                weights = normalise_weights(search.pool_rounds().log_weights)
+                missed = max(missed, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))
         sampler, doubts = search.mix(tilt, self.base_share), search.warnings()
         if missed > 0.05:
             where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
@@ -129,17 +135,3 @@ class ImportanceSampling(Method):
         if reached and search.status is not Status.STOPPED:
             search.status = Status.CONVERGED
         return tilt
-
-
-def unreached_share(search: Search, theta: FloatArray) -> float:
-    """Return the share of the search's failing points that the tilt theta (d,) does not reach.
-
-    The larger of: base draws under the first level with theta' u < 0; failing mass with theta' u < |theta|^2 / 2.
-    """
-    first = search.rounds[0]
-    behind = float((first.u[first.f <= search.trace[0].gamma] @ theta < 0).mean())
-    failing = search.failing_points()
-    if len(failing) == 0:
-        return behind
-    weights = normalise_weights(search.pool_rounds().log_weights)
-    return max(behind, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))

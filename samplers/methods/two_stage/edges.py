@@ -92,10 +92,13 @@ def half_spaces(failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float
     through all points needs an R^2 of `min_r2`; all other fits must locate where failure begins. If f is rather the
     least of linear functions, as in a first passage, each piece of -y has a half-space of its own.
     """
-    usual = _find_usual(f)
-    u, y = u[usual], gamma - f[usual]
-    if len(failures) < PLANES.min_failures:
+    finite = np.isfinite(f) & (np.abs(f) < 1e300)  # an f of -inf arrives as the lowest number, about -1.8e308
+    ordered = np.sort(f[finite])
+    if len(failures) < PLANES.min_failures or len(ordered) == 0:
         return []
+    left_out = int(0.02 * len(ordered))  # at either end f may be capped or wild
+    usual = finite & (f >= ordered[left_out]) & (f <= ordered[-1 - left_out])
+    u, y = u[usual], gamma - f[usual]
     fits = list[Pieces]()
     for rows in (np.arange(len(y)), np.flatnonzero(y >= 0), np.flatnonzero(y < 0)):
         some = rows[_spread(len(rows), 100 * u.shape[1])]
@@ -178,16 +181,6 @@ def _beyond(fit: Pieces, failures: FloatArray) -> HalfSpaceIntersection | None:
     if not kept or (len(kept) == 1 and starts[kept[0]] < PLANES.min_distance):
         return None
     return HalfSpaceIntersection(axes[kept], starts[kept])
-
-
-def _find_usual(f: FloatArray) -> NDArray[np.bool_]:
-    """Return which outcomes (n,) are finite and not among the highest or lowest ones: f may be capped or wild there."""
-    finite = np.isfinite(f) & (np.abs(f) < 1e300)  # an f of -inf arrives as the lowest number, about -1.8e308
-    ordered = np.sort(f[finite])
-    if len(ordered) == 0:
-        return finite
-    left_out = int(0.02 * len(ordered))
-    return np.asarray(finite & (f >= ordered[left_out]) & (f <= ordered[-1 - left_out]))
 
 
 def _spread(n: int, most: int) -> NDArray[np.int64]:

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
-from samplers.mcmc import Chains, Kernel, NextLevel, descend, independent_chains, judge_levels
+from samplers.mcmc import Chains, Kernel, NextLevel, RootedPoints, descend, independent_chains, judge_levels
 from samplers.method import Goal, Interrupted
 from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
 from samplers.methods.two_stage.regions import (
@@ -115,7 +115,8 @@ def _plan_level(
 
     Its seeds are a random part of the points below the threshold, its chains of equal length.
     """
-    points = chains.by_step()
+    step, chain = np.nonzero(chains.used.T)  # the first of every chain, the second of every chain, and so on
+    points = RootedPoints(chains.u[chain, step], chains.f[chain, step], chains.roots[chain])
     if depth == 0 and np.count_nonzero(points.f <= gamma) >= EXPLORATION.common_failures:
         return Status.CONVERGED
     threshold = next_level(points.f, EXPLORATION.level_fraction, gamma)
@@ -359,7 +360,8 @@ def find_slopes(
     for size in ((n - first + 1) // 2, (n - first) // 2):
         if not _have_few_directions(slopes):
             return None
-        axes, points = _leading_directions(slopes), points.leave_out(chosen)
+        axes, others = _leading_directions(slopes), np.setdiff1d(np.arange(len(points.u)), chosen)
+        points = _Points(points.u[others], points.fails[others], points.turns[others])
         chosen = _choose_unexplained(points, size, axes)
         more = yield from _differentiate(simulator, points.u[chosen], 0.05)
         slopes = np.concatenate([slopes, more])
@@ -377,11 +379,6 @@ class _Points(NamedTuple):
     """Shape (n,)."""
     turns: NDArray[np.int64]
     """Number of the point among those of its region that fail, or do not, from 0, shape (n,)."""
-
-    def leave_out(self, chosen: NDArray[np.int64]) -> "_Points":
-        """Return the others."""
-        kept = np.setdiff1d(np.arange(len(self.u)), chosen)
-        return _Points(self.u[kept], self.fails[kept], self.turns[kept])
 
 
 def _collect_points(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> _Points:

@@ -28,7 +28,7 @@ from samplers.methods.two_stage.refinement import (
     start_refinement,
     typical_weights,
 )
-from samplers.methods.two_stage.regions import ExplorationResult, is_noisy, sampling_interval
+from samplers.methods.two_stage.regions import ExplorationResult, Region, is_noisy, sampling_interval
 from samplers.methods.two_stage.settings import BUDGET, EXPLORATION, FALLBACK, PROPOSAL
 from samplers.methods.two_stage.stratified import (
     MultipleImportanceSample,
@@ -274,8 +274,12 @@ def _look_for_noise(run: SearchRun, state: RunState, refinement: RefinementState
     heaviest = np.argsort(-state.history.log_weights, kind="stable")[:20]
     if len(heaviest) < 20:
         return refinement
-    noisy = yield from is_noisy(run.simulator, state.history.u[heaviest], run.goal.gamma, run.rng)
-    return start_refinement(refinement.exploration.as_noisy(), run.goal.gamma, run.rng) if noisy else refinement
+    if not (yield from is_noisy(run.simulator, state.history.u[heaviest], run.goal.gamma, run.rng)):
+        return refinement
+    known = refinement.exploration
+    whole = Region(*(np.concatenate(parts) for parts in zip(*known.regions, strict=True)))
+    found = ExplorationResult([whole], noisy=True, levels=known.levels, discovery=known.discovery._replace(regions=1))
+    return start_refinement(found, run.goal.gamma, run.rng)
 
 
 def _gives_up(
@@ -313,29 +317,21 @@ def _fall_back(run: SearchRun, state: RunState, levels: int) -> Steps:
         known = None
     trace, before = run.simulator.close_trace(), _estimate_early(run, state)
     outcome = yield from spend_on_subset_simulation(run.inputs, run.goal, levels, run.left_at_all, known, run.rng)
-    unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
-    whole = before if unfinished else _reconcile(outcome, before)
+    whole = outcome
+    if outcome.status is Status.STOPPED and outcome.p == 0:  # no estimate, then
+        whole = before
+    elif before.interval[0] > outcome.p:  # wide draws also find regions that f does not announce: it is to hold both
+        (low, high), (other_low, other_high) = before.interval, outcome.interval
+        about = f"Subset simulation, which took over, missed failure regions found before; it gives {outcome.p:.1e}."
+        whole = replace(
+            before,
+            interval=(min(low, other_low), max(high, other_high)),
+            status=outcome.status,
+            warnings=(*before.warnings, *outcome.warnings, about),
+            remarks=(*before.remarks, *outcome.remarks),
+        )
     drawn = state.base_draws + outcome.base_draws
     return replace(whole, trace=trace + outcome.trace, base_draws=drawn, wide_draws=before.wide_draws)
-
-
-def _reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
-    """Return the outcome of subset simulation, or the earlier one where its interval lies above it.
-
-    Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
-    earlier outcome then grows to hold both.
-    """
-    if earlier.interval[0] <= subset_outcome.p:
-        return subset_outcome
-    (low, high), (other_low, other_high) = earlier.interval, subset_outcome.interval
-    about = f"Subset simulation, which took over, missed failure regions found before; it gives {subset_outcome.p:.1e}."
-    return replace(
-        earlier,
-        interval=(min(low, other_low), max(high, other_high)),
-        status=subset_outcome.status,
-        warnings=(*earlier.warnings, *subset_outcome.warnings, about),
-        remarks=(*earlier.remarks, *subset_outcome.remarks),
-    )
 
 
 def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:

@@ -167,11 +167,16 @@ def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
 def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> list[SubspaceGaussian]:
     """Return the components of a mixture of at most `most`, their number chosen by BIC."""
     best, highest, worse = list[SubspaceGaussian](), -math.inf, 0
+    mass = np.bincount(points.groups, weights=points.weights, minlength=points.n_groups).astype(np.float64)
+    means = np.zeros((points.n_groups, points.u.shape[1]))
+    np.add.at(means, points.groups, points.u * points.weights[:, None])
+    means, mass = means / np.maximum(mass, TINY_WEIGHT)[:, None], mass / mass.sum()  # of the groups
     for k in (size for size in FIT.sizes if size <= most):
         if k > 1 and (k > points.n_groups or points.ess < 4.0 * k):
             break
         restarts = 1 if k == 1 else 3  # k-means++ draws the centres
-        tries = [_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)]
+        starts = (start_from_centres(means, mass, k, rng)[:, points.groups] for _ in range(restarts))
+        tries = [_fit_from(points, start) for start in starts]
         found, score = max(tries, key=lambda one: one[1])
         worse = 0 if score > highest else worse + 1
         if worse == 0:
@@ -179,17 +184,6 @@ def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Genera
         if worse == 2:  # the score is uneven in their number: after one that is worse, a better one may follow
             break
     return best
-
-
-def _initial_responsibilities(points: GroupedPoints, k: int, rng: np.random.Generator) -> FloatArray:
-    """Return responsibilities (k, n) to start from: clusters of the groups' means."""
-    n_groups = points.n_groups
-    mass = np.bincount(points.groups, weights=points.weights, minlength=n_groups).astype(np.float64)
-    means = np.zeros((n_groups, points.u.shape[1]))
-    np.add.at(means, points.groups, points.u * points.weights[:, None])
-    return start_from_centres(means / np.maximum(mass, TINY_WEIGHT)[:, None], mass / mass.sum(), k, rng)[
-        :, points.groups
-    ]
 
 
 class _Fitted(NamedTuple):
@@ -336,20 +330,8 @@ def keep_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
     for number, floor in enumerate(floors):
         groups[floor.members] = number
     own = np.bincount(groups, a, len(floors) + 1)
-    shares = _raise_shares(own.tolist(), [*(each.least for each in floors), 0.0])
-    if shares is None:
-        return a
-    inside = np.where(own > 0, own, np.bincount(groups, minlength=len(own)))[groups]
-    return np.asarray(np.where(own[groups] > 0, a, 1.0) / inside * np.array(shares)[groups])
-
-
-def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None:
-    """Return shares of groups (m,) raised to their least ones, the others lowered; None if none is too low."""
-    raised: set[int] = set()
-    while True:
-        low = {k for k, share in enumerate(shares) if share < least[k] - 1e-12} - raised  # less is rounding
-        if not low:
-            return shares if raised else None
+    shares, least, raised = own.tolist(), [*(each.least for each in floors), 0.0], set[int]()
+    while low := {k for k, share in enumerate(shares) if share < least[k] - 1e-12} - raised:  # less is rounding
         raised |= low
         total, rest = sum(least[k] for k in raised), sum(share for k, share in enumerate(shares) if k not in raised)
         room = max(1 - total, 0.0) if rest > 0 else 0.0
@@ -358,3 +340,7 @@ def _raise_shares(shares: list[float], least: list[float]) -> list[float] | None
             share * lowered if k not in raised else least[k] if room > 0 else least[k] / total
             for k, share in enumerate(shares)
         ]
+    if not raised:
+        return a
+    inside = np.where(own > 0, own, np.bincount(groups, minlength=len(own)))[groups]
+    return np.asarray(np.where(own[groups] > 0, a, 1.0) / inside * np.array(shares)[groups])

@@ -127,12 +127,6 @@ class ExplorationResult(NamedTuple):
         """Whether no proposal is to be expected: pieces of a shell or a ring, and no few directions that matter."""
         return self.scattered and self.slopes is None and self.regions[0].u.shape[1] > HIGH_DIM
 
-    def as_noisy(self) -> "ExplorationResult":
-        """Return the same with all regions as one."""
-        whole = Region(*(np.concatenate(parts) for parts in zip(*self.regions, strict=True)))
-        found = self.discovery._replace(regions=1)
-        return self._replace(regions=[whole], noisy=True, scattered=False, slopes=None, discovery=found)
-
     def within(self, axes: FloatArray) -> "ExplorationResult":
         """Return the same in the coordinates of orthonormal axes (d, r)."""
         return self._replace(regions=[region.within(axes) for region in self.regions], slopes=None)
