@@ -166,16 +166,6 @@ FARTHEST_U = 7.0
 """Largest |u| where a distribution has no points farther out in OpenTURNS: P[U > 7] = 1.3e-12, below what is estimated.
 From 8 on, where 1 - P[U > u] is nearly 1 in double precision, the quantile of a Student distribution is infinite and
 that of a Gumbel copula is not a number."""
-TRIED_U = np.array([9.0, 12.0, 20.0, 30.0])
-"""|u| at which it is tried whether points have a place farther out."""
-CHECKED_POINTS = 12
-"""Points at which the transformation is compared with the density."""
-CHECKED_DIMS = 50
-"""Dimensions up to which it is compared: the comparison takes 24 points for each."""
-CHECK_STEP = 1e-3
-"""Step in u of the finite differences of the comparison."""
-LARGEST_ERROR = 0.02
-"""Error of the density by the transformation, as a difference of logarithms, at half of the points."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,8 +187,8 @@ class OpenTurnsDistribution(DrawnByItsMap):
                 f"The iso-probabilistic transformation of this {name} leads to {leads_to}, not to N(0, I): "
                 "use another copula, such as openturns.NormalCopula."
             )
-        error = self._density_error() if self.dim <= CHECKED_DIMS else 0.0
-        if error > LARGEST_ERROR:
+        error = self._density_error() if self.dim <= 50 else 0.0  # it takes 24 points for each
+        if error > 0.02:  # of log p at half of the points
             raise ValueError(
                 f"OpenTURNS' iso-probabilistic transformation of this {name} does not have its density (off by "
                 f"{100 * math.expm1(error):.0f} %), so that p would be wrong: give an object with sample, log_prob, "
@@ -206,13 +196,14 @@ class OpenTurnsDistribution(DrawnByItsMap):
             )
 
     def _density_error(self) -> float:
-        """Return the median of |log p(x) - log phi(u) + log |det dx/du|| over some points."""
-        u = np.random.default_rng(0).standard_normal((CHECKED_POINTS, self.dim))
-        steps = CHECK_STEP * np.eye(self.dim)
-        ahead, behind = (self.from_standard_normal((u[:, None] + s * steps).reshape(-1, self.dim)) for s in (1, -1))
-        slopes = ((ahead - behind) / (2 * CHECK_STEP)).reshape(CHECKED_POINTS, self.dim, self.dim)
+        """Return the median of |log p(x) - log phi(u) + log |det dx/du|| over some points, by finite differences."""
+        n, dim, step = 12, self.dim, 1e-3
+        u = np.random.default_rng(0).standard_normal((n, dim))
+        beside = step * np.eye(dim)
+        ahead, behind = (self.from_standard_normal((u[:, None] + s * beside).reshape(-1, dim)) for s in (1, -1))
+        slopes = ((ahead - behind) / (2 * step)).reshape(n, dim, dim)
         volume = np.linalg.slogdet(slopes).logabsdet
-        log_phi = -0.5 * (u**2).sum(axis=1) - 0.5 * self.dim * LOG_TWO_PI
+        log_phi = -0.5 * (u**2).sum(axis=1) - 0.5 * dim * LOG_TWO_PI
         return float(np.median(np.abs(self.log_prob(self.from_standard_normal(u)) - log_phi + volume)))
 
     @property
@@ -247,7 +238,8 @@ class OpenTurnsDistribution(DrawnByItsMap):
     def _is_cut(self) -> bool:
         """Whether points far out have no place, so that u is cut for all points alike, whatever their batch."""
         try:
-            ends = [self._find_x(far * np.repeat(TRIED_U[:, None], self.dim, axis=1)) for far in (-1.0, 1.0)]
+            far = np.repeat([[9.0], [12.0], [20.0], [30.0]], self.dim, axis=1)
+            ends = [self._find_x(side * far) for side in (-1.0, 1.0)]
         except (TypeError, ValueError, RuntimeError):  # the errors of OpenTURNS
             return True
         return not np.isfinite(ends).all()
@@ -335,8 +327,6 @@ def convert(base: Any) -> Any:
     return OpenTurnsDistribution(base) if known else None
 
 
-N_DRAWS = 200
-"""Draws of a base distribution that are looked at, to see whether its parts fit together."""
 FALSE_ALARM = 1e-6
 """Largest probability that a base whose parts fit is refused."""
 ROUND_TRIP = 1e-3
@@ -345,7 +335,7 @@ MAX_CORRELATED = 1000
 """Coordinates up to which every pair is looked at; of more, the pairs within blocks of so many."""
 
 
-def find_base_fault(base: Any, dim: int, n: int = N_DRAWS) -> str | None:
+def find_base_fault(base: Any, dim: int, n: int = 200) -> str | None:
     """Return what does not fit together in a base distribution of d coordinates, in words; None if nothing is seen.
 
     If its map is not implemented, which plain Monte Carlo does not need, only n draws and their density are looked at.

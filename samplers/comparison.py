@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import stdtrit
 
-from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, summarise_refits
+from samplers.analysis.base_error import BaseUncertainty, summarise_refits
 from samplers.analysis.gate import Verdict, find_doubt, judge_ends
-from samplers.analysis.reweight import MAX_LOG, find_fitted_base, reweight_runs_to_refits
+from samplers.analysis.reweight import MAX_LOG, RefitSums, find_fitted_base, reweight_runs_to_refits
 from samplers.analysis.weighted import (
     cov_inflation,
     find_missed,
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     import pyarrow
     from matplotlib.axes import Axes
 
-MIN_SIDE_ESS = 30.0
-"""Effective failing units below which a probability is called coarse: its c.o.v. is then about 0.2 or more."""
 RATIO_COARSE = "the ratio is imprecise"
 """Words of the warnings that say how imprecise the ratio is, which its interval includes."""
 ROUNDING = 1e-12
@@ -391,7 +389,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     few = [
         f"{name} failed in no draw" if s.ess == 0 else f"{name} failed in only {s.ess:.0f} effective draws"
         for name, s in (("A", a), ("B", b))
-        if s.ess < MIN_SIDE_ESS
+        if s.ess < 30  # its c.o.v. is about 0.2 or more
     ]
     about = [f"{' and '.join(few)}: {RATIO_COARSE}; estimate each separately."] if few else []
     for name, own, s in (("A", totals[0], a), ("B", totals[1], b)):
@@ -427,15 +425,16 @@ def _base_uncertainty(
     if fitted is None:
         return None
     p_a, p_b = (float(p) for p in totals.sum(axis=1))
-    if p_a == 0 or p_b == 0:
-        why = "A or B never failed."
-        return summarise_refits(_ratio(p_a, p_b), math.inf, either.confidence, fitted, NO_SUMS, reason=why)
-    sums = reweight_runs_to_refits(either, fitted.refits, lambda run: problem.failing_parts(require_sample(run).x))
-    cov = factor * _error(totals[0] / p_a - totals[1] / p_b)
-    n_sim = 0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim
-    return summarise_refits(
-        p_a / p_b, cov, either.confidence, fitted, sums, sampling=sampling, n_sim=n_sim, is_ratio=True
-    )
+
+    def compute_sums() -> RefitSums:
+        if p_a == 0 or p_b == 0:
+            raise ValueError("A or B never failed.")
+        return reweight_runs_to_refits(either, fitted.refits, lambda run: problem.failing_parts(require_sample(run).x))
+
+    cov = factor * _error(totals[0] / p_a - totals[1] / p_b) if p_a > 0 and p_b > 0 else math.inf
+    about: dict[str, Any] = {"n_sim": 0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim}
+    about |= {"sampling": sampling, "is_ratio": True}
+    return summarise_refits(_ratio(p_a, p_b), cov, either.confidence, fitted, compute_sums, **about)
 
 
 def _ratio(a: float, b: float) -> float:

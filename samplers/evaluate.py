@@ -39,13 +39,10 @@ from samplers.problem import (
 
 CHUNK_SIZE = 16
 """Rows of a chunk of workers if the problem has no `chunk_size`."""
-N_CHECKED = 8
-"""Points at which a continued journal calls f again, from the least f of its first chunk to the largest."""
 F_TOLERANCE = 1e-3
 """Largest difference of f there, as a share of the largest |f|: products of networks round differently by batch."""
 WASTED_SHARE = 0.1
 """Rows in parts that raise, while those that raise are looked for, as a share of the chunk and of the rows done."""
-NAN_REASON = "f is NaN"
 
 Index = tuple[int, ...]
 """Number of a chunk in its run; of a row computed by itself, also its number in the chunk. It keys random draws."""
@@ -216,7 +213,7 @@ def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
         f = np.where(np.isnan(values).any(axis=1), np.nan, f)
         table = np.column_stack((f, values, ticks))
         notes = {"threshold": float(found.threshold), "names": list(getattr(found, "names", ()))}
-    reasons = dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), NAN_REASON) | reasons
+    reasons = dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN") | reasons
     return Result(table, {**notes, "reasons": reasons})
 
 
@@ -492,7 +489,7 @@ class Evaluator:
         if self._checked:
             return
         self._checked = True
-        rows = np.argsort(known)[np.unique(np.linspace(0, len(chunk) - 1, N_CHECKED).astype(int))]
+        rows = np.argsort(known)[np.unique(np.linspace(0, len(chunk) - 1, 8).astype(int))]
         f, part = known[rows], Request("f", (chunk.x[rows],))
         ((_, again),) = self.pool.run([(0, part)])
         changed = find_changed(again.table[:, 0], f)

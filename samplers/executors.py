@@ -51,8 +51,6 @@ QUIET_SECONDS = 180.0
 """Time [s] without a result after which a warning says so: a chunk is meant to take seconds."""
 START_SECONDS = 300.0
 """Time [s] beyond the limit of a chunk in which its process may start and load the problem; then it is given up."""
-POLL_SECONDS = 0.05
-"""Time [s] between two looks at jobs that cannot tell when they are done, such as those of submitit."""
 MOST_RESTARTS = 1000
 """Broken pools that are replaced in the place of one in one run."""
 ENVIRONMENT = {
@@ -364,7 +362,7 @@ class WorkerPool(Pool):
 
     def _watch(self, job: Any, call: int) -> None:
         while not job.done():
-            time.sleep(POLL_SECONDS)
+            time.sleep(0.05)
         self._done.put((call, time.monotonic()))
 
     def _replace(self, slot: int, error: Exception) -> None:

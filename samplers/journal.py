@@ -41,8 +41,6 @@ TABLE = (
 COLUMNS = "id, points, width, n_sim, seconds, notes, numbers"
 INSERT = f"INSERT OR IGNORE INTO chunks ({COLUMNS}, digest) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
 MAGIC, HEADER_SIZE = b"SQLite format 3\0", 100
-MOST_MISSING = 2**30
-"""Bytes that are put in the place of a missing end at most: a header may be damaged too."""
 HEAD = 0
 """Number of the record that says what the run is, in its notes; chunks have 1 and more."""
 
@@ -300,7 +298,7 @@ def _count_missing(path: Path) -> int:
     if len(header) < HEADER_SIZE or not header.startswith(MAGIC):
         return 0
     page_size, n_pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
-    return max(min(page_size * n_pages, MOST_MISSING + found.st_size) - found.st_size, 0)
+    return max(min(page_size * n_pages, 2**30 + found.st_size) - found.st_size, 0)  # a header may be damaged too
 
 
 def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:

@@ -42,9 +42,6 @@ from samplers.sample import (
 if TYPE_CHECKING:
     from samplers.run import Run
 
-MANY_FAILURES = 5
-"""Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
@@ -141,7 +138,7 @@ class Outcome:
             interval=clopper_pearson(hits, n, confidence),
             cov=binomial_cov(hits / n, n),
             status=Status.CONVERGED if hits else Status.NO_HITS,
-            warnings=(few,) if hits < MANY_FAILURES else (),
+            warnings=(few,) if hits < 5 else (),  # a c.o.v. above about 0.45
             trace=tuple(trace),
             no_outcome_share=no_outcome_share,
             counts=(hits, n),
@@ -317,11 +314,7 @@ def request_gradients(
 
 def whole_simulations(cost: float) -> int:
     """Return the whole number of simulations that the cost of a batch of gradients counts as."""
-    return math.ceil(cost - COST_ROUNDING)
-
-
-COST_ROUNDING = 1e-6
-"""Sums of costs may be off by a rounding error."""
+    return math.ceil(cost - 1e-6)  # sums of costs may be off by a rounding error
 
 
 @runtime_checkable

@@ -38,12 +38,8 @@ from samplers.sample import (
 
 MIN_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
-MAX_REPLICATES = 200
-"""Runs made at most for target_cov: if they miss it, each run is too small."""
 NO_OUTCOME = -np.inf
 """f as methods see it for a row without an outcome (counted as failing, on_error not "raise")."""
-SMALLEST_F = float(np.finfo(np.float64).min)
-"""f as methods see it where f is -inf, so that NO_OUTCOME keeps its meaning."""
 NOT_KNOWN = Outcome(
     p=0.0,
     interval=(0.0, 1.0),
@@ -82,7 +78,7 @@ def needs_another(runs: Sequence[Replicate], method: Stepping, goal: Goal, repli
     pool, which can be cut short (beside longer ones, a short run would spoil a mean).
     """
     outcomes = [run.outcome for run in runs if run.outcome is not None]
-    if meets_target(outcomes, goal.target_cov, replicates) or len(runs) >= MAX_REPLICATES:
+    if meets_target(outcomes, goal.target_cov, replicates) or len(runs) >= 200:  # each is too small
         return False
     targets = [run.goal.target_cov for run in runs]
     missed = [t is not None and outcome.cov > t for t, outcome in zip(targets, outcomes, strict=True)]
@@ -116,7 +112,7 @@ class Replicate:
         """
         f, seen = outcomes_of(answer), answer
         if f is not None:
-            shown = np.where(np.isnan(f), NO_OUTCOME, np.maximum(f, SMALLEST_F))
+            shown = np.where(np.isnan(f), NO_OUTCOME, np.maximum(f, np.finfo(np.float64).min))  # -inf keeps its meaning
             seen = shown
             if isinstance(answer, Terms):
                 values = np.where(np.isneginf(shown)[:, None], -np.inf, answer.values)
@@ -190,10 +186,6 @@ def _check_outcome(value: object) -> Outcome:
 
 # Several as one
 
-OWN_ERROR_FACTOR = 1.5
-"""Factor by which runs may understate their own errors before they are said to disagree."""
-MIN_SPREAD = 1 / 3
-"""Least spread of runs, as a share of their own errors: they are closer together by chance, such as counts that tie."""
 UNINFORMATIVE_COV = 1.0
 """From this c.o.v. on the p of a run adds nothing to its interval."""
 DISAGREEMENT_LEVEL = 1e-4
@@ -310,14 +302,15 @@ def _mean_interval(outcomes: Sequence[Outcome], p: FloatArray, confidence: float
     if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
         return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
     spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
-    spread = max(spread, MIN_SPREAD * _own_error(outcomes))
+    spread = max(spread, 1 / 3 * _own_error(outcomes))  # runs are closer together by chance, such as counts that tie
     half = float(stdtrit(runs - 1, 0.5 + confidence / 2)) * spread / math.sqrt(runs)
     return mean * math.exp(-half), min(1.0, mean * math.exp(half))
 
 
 def _warn_of_disagreement(outcomes: Sequence[Outcome], p: FloatArray) -> list[str]:
     """Return a warning if runs with p (R,) lie further apart than their errors allow: some of them missed a region."""
-    error = OWN_ERROR_FACTOR * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
+    # runs may understate their own errors
+    error = 1.5 * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
     if len(p) < 3 or not (error > 0).all():
         return []
     with np.errstate(over="ignore"):  # inf is far enough apart

@@ -52,15 +52,11 @@ if TYPE_CHECKING:
     import pyarrow
     from matplotlib.axes import Axes
 
-PLOTTED_THRESHOLDS = 60
-"""Thresholds of the curve that `Estimate.plot` draws."""
 
 NEGLIGIBLE = 0.1
 """Share of the squared width of an interval below which its source does not limit it."""
 NAMED_STRATA = 2
 """Strata without enough failures that are named."""
-LEAST_ODDS = 1e-9
-"""Probability from which on it is also written as "1 in n"."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -269,7 +265,7 @@ class Estimate(EstimateData, Kept):
         order = np.argsort(finite)
         reached = np.cumsum(sample.weights[np.isfinite(sample.f)][order])
         high = float(finite[order][min(np.searchsorted(reached, reached[-1] / 2), len(order) - 1)])
-        grid = np.unique([*np.linspace(low, max(low, high, self.gamma), PLOTTED_THRESHOLDS), max(low, self.gamma)])
+        grid = np.unique([*np.linspace(low, max(low, high, self.gamma), 60), max(low, self.gamma)])
         with drawing_axes(ax) as axes:
             self.curve(grid).plot(axes)
             axes.axvline(self.gamma, linestyle=":", color="0.4")
@@ -508,7 +504,7 @@ def _describe_p(estimate: Estimate, noun: str) -> str:
 
 def describe_odds(p: float, noun: str = "") -> str:
     """Return a small p as " (1 in n)", of what `noun` says; empty if it is large, or too small to be read so."""
-    return f" (1 in {float(f'{1 / p:.2g}'):,.0f}{noun and f' {noun}'})" if LEAST_ODDS < p < 0.1 else ""
+    return f" (1 in {float(f'{1 / p:.2g}'):,.0f}{noun and f' {noun}'})" if 1e-9 < p < 0.1 else ""
 
 
 def describe_limit(

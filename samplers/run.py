@@ -108,13 +108,10 @@ def choose_seed(seed: int | None) -> int:
     return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
 
 
-SEARCHED = 2000
-"""Simulations from which on a search by levels of f is worth while in any dimension."""
-
-
 def advise(n_sim: int, closest: Closest) -> str:
     """Return how near a run without a failure that counts came to one, and what would do better."""
-    more = max(SEARCHED, 10 ** math.ceil(math.log10(4 * max(n_sim, 1))))
+    # from there on a search by levels is worth while in any dimension
+    more = max(2000, 10 ** math.ceil(math.log10(4 * max(n_sim, 1))))
     came = f"The nearest approach was {closest}. " if closest.f < math.inf else ""
     return f"{came}More simulations (max_sim={more}, --max-sim {more}) would search further towards failure."
 

@@ -344,10 +344,6 @@ def effective_number(terms: FloatArray) -> float:
 Interval = tuple[float, float]
 MAX_SKEWNESS = 0.4
 """Skewness of a mean up to which its first two terms describe it; Hall's end has a pole at about 0.47."""
-MIN_SKEWNESS = 1e-3
-"""Less is none."""
-LARGE_ESS = 200
-"""From this effective number of units on normal quantiles are used, below it t quantiles (1 to 3 % larger here)."""
 
 
 def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
@@ -433,14 +429,14 @@ def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -
     quantile, the end is p (1 + 3 cov / g (1 - (1 - g (z + g / 6))^(1/3))).
     """
     z, g = float(ndtri(0.5 + confidence / 2)), min(skewness, MAX_SKEWNESS)
-    if g < MIN_SKEWNESS:
+    if g < 1e-3:
         return min(1.0, p * (1 + z * cov))
     return min(1.0, p * (1 + 3 * cov / g * (1 - float(np.cbrt(1 - g * (z + g / 6))))))
 
 
 def degrees_of_freedom(ess: float, independent: bool) -> float:
     """Return those of a sum over `ess` units; inf for many. Single draws, whose weights are skewed, have a quarter."""
-    if ess > LARGE_ESS:
+    if ess > 200:  # t quantiles are 1 to 3 % larger here
         return math.inf
     return max(ess / 4, 3.0) if independent else max(ess - 1, 1.0)
 
@@ -457,10 +453,6 @@ def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
     return (1 - p) / (p * cov * cov * n_sim)
 
 
-MAX_TIED_SHARE = 0.5
-"""A tied level that keeps more than this share of the points is no progress."""
-
-
 def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
     """Return the next threshold for outcomes f (n,), or None if there is none to go to.
 
@@ -474,7 +466,7 @@ def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
         return gamma
     quantile = float(np.partition(f, math.ceil(wanted) - 1)[math.ceil(wanted) - 1])
     up_to, below = int(np.count_nonzero(f <= quantile)), int(np.count_nonzero(f < quantile))
-    usable = up_to <= MAX_TIED_SHARE * n
+    usable = up_to <= 0.5 * n  # more is no progress
     if below > 0 and (not usable or up_to * below > wanted * wanted):
         return max(gamma, float(f[f < quantile].max()))
     return max(gamma, quantile) if usable else None

@@ -17,12 +17,8 @@ from uuid import uuid4
 from samplers.evaluate import Index, Result, Work
 from samplers.method import Request
 
-ENDED_ITSELF = "1"
-"""Exit code of a process that `faulthandler.dump_traceback_later` has ended at the limit of time."""
 SAFE_PATH = "PYTHONSAFEPATH"
 """Variable by which Python leaves the working directory out."""
-PARENT_SECONDS = 1.0
-"""Time [s] between two looks of a worker whether its driver is still there."""
 
 
 class WorkerLost(Exception):
@@ -129,7 +125,7 @@ def end_with(driver: int) -> None:
 
     def watch() -> None:
         while os.getppid() == driver:
-            time.sleep(PARENT_SECONDS)
+            time.sleep(1.0)
         os._exit(1)
 
     if os.getppid() == driver and not any(thread.name == _WATCH for thread in threading.enumerate()):
@@ -183,7 +179,8 @@ def describe_loss(error: BaseException, seconds: float, limit: float | None) -> 
     ended = re.search(r"exit codes of the workers are \{(?:EXIT|(\w+))\((-?\d+)\)", str(error))
     if ended is not None and ended[1]:
         return f"the process of the simulation was ended by {ended[1]}"
-    if limit is not None and seconds >= limit and (ended is None or ended[2] == ENDED_ITSELF):
+    # as `faulthandler.dump_traceback_later` ends it
+    if limit is not None and seconds >= limit and (ended is None or ended[2] == "1"):
         return f"no answer within {limit:g} s"
     if ended is not None:
         return f"the process of the simulation ended with exit code {ended[2]}"

@@ -27,8 +27,9 @@ is on the safe side: its large values come together.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -55,8 +56,6 @@ FIT_BIAS = 0.2
 keeps the interval of thousands of events from being too narrow, and is nothing beside the spread at 38."""
 MIN_REFITS = 2
 """Refits, and clusters of events, from which there is a spread at all."""
-NO_SUMS = RefitSums(np.empty((1, 0)), np.empty((1, 0)))
-"""Of no refits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,32 +139,29 @@ def compute_base_uncertainty(estimate: EstimateData) -> BaseUncertainty | None:
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
         return None
-    sums, reason = NO_SUMS, ""
-    try:
-        sums = reweight_runs_to_refits(estimate, fitted.refits)
-    except ValueError as error:
-        reason = str(error)
     further = estimate.ensemble_run
     found = summarise_refits(
         estimate.p,
         estimate.cov,
         estimate.confidence,
         fitted,
-        sums,
+        lambda: reweight_runs_to_refits(estimate, fitted.refits),
         sampling=estimate.interval,
         lineages=estimate.lineages,
         n_sim=0 if further is None else further.n_sim,
         doubts=[] if further is None else [f"in the further run: {text}" for text in further.warnings],
-        reason=reason,
     )
     if found.interval is None or estimate.on_error != "bound" or estimate.no_outcome_share == 0:
         return found
     p, cov, _ = estimate_known(estimate, estimate.gamma, estimate.confidence)
     known = None
     if p > 0:
-        sums = reweight_runs_to_refits(
-            estimate, fitted.refits, lambda run: np.isfinite((s := require_sample(run)).f[s.f <= run.gamma])[None] * 1.0
-        )
+
+        def mark(run: EstimateData) -> FloatArray:  # the failing points that have an outcome
+            sample = require_sample(run)
+            return np.isfinite(sample.f[sample.f <= run.gamma])[None].astype(np.float64)
+
+        sums = partial(reweight_runs_to_refits, estimate, fitted.refits, mark)
         known = summarise_refits(p, cov, estimate.confidence, fitted, sums, sampling=estimate.interval).interval
     return replace(found, interval=(0.0 if known is None else known[0], found.interval[1]))
 
@@ -175,26 +171,29 @@ def summarise_refits(
     cov: float,
     confidence: float,
     fitted: FittedBase,
-    sums: RefitSums,
+    compute_sums: Callable[[], RefitSums],
     *,
     sampling: Interval | None = None,
     lineages: float = math.inf,
     largest: float = 1.0,
     n_sim: int = 0,
     doubts: Sequence[str] = (),
-    reason: str = "",
     is_ratio: bool = False,
 ) -> BaseUncertainty:
     """Return the uncertainty of p, of another mean over failures or of a ratio from its values under refits.
 
-    `largest` is the largest value that a mean can have, in units of which `sums` are; for a ratio, `sums` has the two
-    probabilities. The interval holds that of the sampling, and its upper limit what a search of
-    some `lineages` may miss.
+    `largest` is the largest value that a mean can have, in units of which the sums are; for a ratio, these are of the
+    two probabilities. A ValueError says why there are none. The interval holds that of the sampling, and its upper
+    limit what a search of some `lineages` may miss.
     """
-    log_values, ess = sums.log_p[0] + math.log(largest), sums.ess.min(axis=0)
-    if is_ratio and not reason:
-        known = np.isfinite(sums.log_p).all(axis=0)
-        log_values = np.where(known, np.subtract(*np.where(known, sums.log_p, 0.0)), -np.inf)
+    try:
+        (log_p, all_ess), reason = compute_sums(), ""
+    except ValueError as error:
+        (log_p, all_ess), reason = np.empty((2, 1 + is_ratio, 0)), str(error)
+    log_values, ess = log_p[0] + math.log(largest), all_ess.min(axis=0)
+    if is_ratio:
+        known = np.isfinite(log_p).all(axis=0)
+        log_values = np.where(known, np.subtract(*np.where(known, log_p, 0.0)), -np.inf)
     reason = reason or _explain_missing_spread(log_values, fitted.clusters)
     interval, expected, spread, bound = None, None, math.nan, None
     if not reason:
@@ -309,8 +308,8 @@ def compute_refit_band(
         scale = 1 / np.sqrt(np.diag(covariance))
         level = simultaneous_level(np.asarray(covariance * np.outer(scale, scale)), confidence, seed)
     for i in known:
-        values = RefitSums(sums.log_p[i : i + 1], sums.ess[i : i + 1])
-        found = summarise_refits(float(p[i]), float(cov[i]), level, fitted, values, lineages=lineages)
+        own = partial(RefitSums, sums.log_p[i : i + 1], sums.ess[i : i + 1])
+        found = summarise_refits(float(p[i]), float(cov[i]), level, fitted, own, lineages=lineages)
         low[i], high[i] = found.interval or (0.0, 1.0 if found.bound is None else found.bound)
         spread[i] = found.spread
     rising = np.argsort(thresholds)

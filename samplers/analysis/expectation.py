@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.base_error import NO_SUMS, BaseUncertainty, RefitBand, compute_refit_band, summarise_refits
+from samplers.analysis.base_error import BaseUncertainty, RefitBand, compute_refit_band, summarise_refits
 from samplers.analysis.curve import Curve, as_thresholds
 from samplers.analysis.reweight import FittedBase, RefitSums, choose_better_run, find_fitted_base, reweight_to_refits
 from samplers.analysis.weighted import (
@@ -140,24 +140,17 @@ def expect_under_refits(
         return None
     pairs = [(failures, np.asarray(values, dtype=np.float64)), further]
     largest = max(float(each[1].max()) for each in pairs if each is not None)
-    sums, reason = NO_SUMS, ""
-    try:
-        sums = _sum_parts_under_refits(
-            estimate, fitted, [None if each is None else (each[0], each[1][None] / largest) for each in pairs]
-        )
-    except ValueError as error:
-        reason = str(error)
+    parts = [None if each is None else (each[0], each[1][None] / largest) for each in pairs]
     return summarise_refits(
         expectation.value,
         expectation.cov,
         estimate.confidence,
         fitted,
-        sums,
+        lambda: _sum_parts_under_refits(estimate, fitted, parts),
         sampling=expectation.interval,
         lineages=estimate.lineages,
         largest=largest,
         n_sim=0 if further is None or estimate.ensemble_run is None else estimate.ensemble_run.n_sim,
-        reason=reason,
     )
 
 

@@ -158,8 +158,6 @@ def judge_estimate(estimate: EstimateData, max_p: float, base: BaseUncertainty |
 
 MAX_PILOT_COV = 0.5
 """C.o.v. of a pilot from which it tells too little: its own error is then of the order of a factor of 2."""
-MIN_RUNS = 5
-"""Single runs that are made at least where one misses the target."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +251,7 @@ def plan(pilot: Any, target_cov: float) -> tuple[PlannedRun, ...]:
     if pilot.final_draws is not None:
         own = pilot.n_sim - pilot.final_draws + pilot.final_draws * factor
     else:
-        own = float(pilot.n_sim) * (1.0 if factor <= 1.0 else max(MIN_RUNS, math.ceil(factor)))
+        own = float(pilot.n_sim) * (1.0 if factor <= 1.0 else max(5, math.ceil(factor)))
     spread = math.sqrt(pilot.p * (1.0 - pilot.p))
     if pilot.strata:  # plain draws in proportion to w_k times the standard deviation (Neyman, 1934)
         spread = math.fsum(share * math.sqrt(p * (1.0 - p)) for share, p in pilot.strata)

@@ -49,8 +49,6 @@ SHORT = 2000
 """Simulations up to which `AdaptiveSubsetSimulation` is better than `TwoStage` in many dimensions, where gradients and
 rounds take what the search leaves: with 1,500 in 21 to 500 (16 limit states, 6 runs) 2 of 96 runs were off by more than
 4 of their standard errors for 27, at half the mean square error; with 3,000 the variance was 8 times as large."""
-LONG = 30
-"""Dimensions from which `Series` takes over; with fewer the exploration of `TwoStage` misses as little."""
 ENOUGH = 1000
 """Simulations from which `Series` has room for walks, rounds and an estimate."""
 SLOW = 1.0
@@ -110,7 +108,8 @@ class Auto(Method):
         noise, offer = noise_mask(inputs), offer_of(inputs)
         dim = inputs.dim - (0 if noise.all() else int(np.count_nonzero(noise)))
         size = f"{budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}"
-        if offer is not None and offer.gradient_cost is not None and inputs.dim >= LONG and budget >= ENOUGH:
+        # with fewer coordinates `TwoStage` misses as little
+        if offer is not None and offer.gradient_cost is not None and inputs.dim >= 30 and budget >= ENOUGH:
             outcome = yield from Series().steps(inputs, goal, rng)
             return replace(outcome, chosen=Choice(Series(), f"series: {size} and terms", unusual=True))
         if budget > FEW:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from samplers.bases import DrawnByItsMap
 from samplers.components import MixtureComponent
 from samplers.method import Goal
-from samplers.problem import Distribution, FloatArray, Inputs
+from samplers.problem import FloatArray, Inputs
 from samplers.sample import Level
 
 
@@ -42,8 +42,8 @@ class NoiseMarginalisedInputs(DrawnByItsMap):
         self._numbers: dict[bytes, int] = {}
 
     @property
-    def base(self) -> Distribution:
-        """Their distribution."""
+    def base(self) -> Any:
+        """Their distribution, which a search only draws from."""
         return self
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
@@ -55,14 +55,6 @@ class NoiseMarginalisedInputs(DrawnByItsMap):
             number = self._numbers.setdefault(key, len(self._numbers))
             whole[row, self._noise] = np.random.default_rng((self._seed, number)).standard_normal(count)
         return self._base.from_standard_normal(whole)
-
-    def to_standard_normal(self, x: FloatArray) -> FloatArray:
-        """Map x (n, d) to u (n, k)."""
-        return self._base.to_standard_normal(x)[:, ~self._noise]
-
-    def log_prob(self, x: FloatArray) -> FloatArray:
-        """Return the log density of x (n, d), noise included, shape (n,)."""
-        return self._base.log_prob(x)
 
 
 _T = TypeVar("_T")
@@ -143,6 +135,4 @@ class ComponentDraws(NamedTuple):
     u: FloatArray  # (n, d)
     f: FloatArray  # (n,)
     first: int = 0  # simulations that the run had spent before the first of them
-    x: FloatArray | None = (
-        None  # in physical space, (n, d), where they are kept: a fitted base is slow to map them again
-    )
+    x: FloatArray | None = None  # in physical space, (n, d), if they are kept: a fitted base is slow to map them again

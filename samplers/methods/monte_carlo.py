@@ -1,5 +1,6 @@
 """Plain Monte Carlo, and independent draws that are kept."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -38,7 +39,7 @@ class KeptDraws:
         """Failing draws and all draws."""
         return self._hits, self._n
 
-    def outcome(self, goal: Goal, trace: list[Level]) -> Outcome:
+    def outcome(self, goal: Goal, trace: Sequence[Level]) -> Outcome:
         """Return the outcome of a run that ends with them; kept draws stand for all, and their weights make p exact."""
         (hits, n), f = self.counts, np.concatenate(self._f)
         x, failing = np.concatenate(self._x), np.concatenate(self._f_failing)

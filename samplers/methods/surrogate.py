@@ -19,16 +19,14 @@ from scipy.special import logsumexp, ndtri
 
 from samplers.bases import Gaussian
 from samplers.importance import Draws, count_final_draws, weighted_interval
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps
 from samplers.methods.base import SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.kriging import MANY_DIMS, Kriging, Prediction, fit_kriging
-from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.monte_carlo import KeptDraws, MonteCarlo
 from samplers.methods.two_stage.regions import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Mixture, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import (
-    DrawWeights,
-    Sample,
     Status,
     add_unseen,
     clopper_pearson,
@@ -325,13 +323,9 @@ class SurrogateRun:
 
     def estimate_early(self, status: Status) -> Outcome:
         """Return what the base draws of the first design say, for a run that ends before its estimate."""
-        f, n = self.f[: self.n_base], self.n_base
-        fails = f <= self.goal.gamma
-        trace = self.simulator.close_trace()
-        outcome = Outcome.of_counts(int(fails.sum()), n, self.goal.confidence, trace, no_outcome_share(f[fails]))
-        sample = Sample.of_equal_draws(f, self.inputs.base.from_standard_normal(self.u[:n][fails]))
-        weights = (DrawWeights.of_equal_draws(n, 0, n),)
-        return replace(outcome, counts=None, status=status, sample=sample, draw_weights=weights)
+        draws = KeptDraws(self.goal.gamma, self.whole.dim)
+        draws.add(self.inputs.base.from_standard_normal(self.u[: self.n_base]), self.f[: self.n_base])
+        return replace(draws.outcome(self.goal, self.simulator.close_trace()), counts=None, status=status)
 
 
 @dataclass(frozen=True, kw_only=True)

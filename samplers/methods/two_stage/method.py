@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.importance import Draws, weight_warnings, weighted_interval
+from samplers.importance import Draws, weighted_interval
 from samplers.mcmc import RootedPoints
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps
 from samplers.methods.base import (
     ComponentDraws,
     RunContext,
@@ -17,6 +17,7 @@ from samplers.methods.base import (
     Simulator,
     marginalise_noise,
 )
+from samplers.methods.monte_carlo import KeptDraws
 from samplers.methods.subset import FEWEST_LEVELS, spend_on_subset_simulation
 from samplers.methods.two_stage.exploration import Sizes, draw_isotropic, find_regions, find_slopes
 from samplers.methods.two_stage.mixture import MixtureProposal
@@ -39,7 +40,7 @@ from samplers.methods.two_stage.stratified import (
     describe_discovery,
 )
 from samplers.problem import FloatArray, Inputs, check_settings
-from samplers.sample import DrawWeights, Interval, Sample, Status, add_unseen, binomial_cov, effective_sample_size
+from samplers.sample import Interval, Status, add_unseen, binomial_cov, effective_sample_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -390,39 +391,36 @@ def _estimate_early(run: SearchRun, state: RunState) -> Outcome:
     outcome = _outcome(run, state, draws, draws.cov, interval)
     parts = [(batch.first, len(batch.f)) for batch in state.history.batches]
     weights = tuple(part for each in draws.weights_after(0) for part in each.split(*parts))
-    return replace(outcome, sample=draws.sample, draw_weights=weights, status=Status.STOPPED)
+    return replace(outcome, draw_weights=weights, status=Status.STOPPED)
 
 
 def _run_monte_carlo(run: SearchRun, state: RunState, *, counted: bool = True) -> Steps:
     """Spend the rest on base draws."""
-    goal, inputs, stopped, first = run.goal, run.simulator.inputs, False, run.simulator.n_sim
-    u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
-    size = 10_000 if goal.target_cov is None else _target_batch(run)
+    goal, simulator, first, stopped = run.goal, run.simulator, run.simulator.n_sim, False
+    size, base = 10_000 if goal.target_cov is None else _target_batch(run), simulator.inputs.base
+    draws, explored = KeptDraws(goal.gamma, run.inputs.dim), base.from_standard_normal(state.base_u)
+    if counted:
+        draws.add(explored, state.base_f)
     while run.left_at_all > 0:
-        new_u = run.rng.standard_normal((min(run.left_at_all, size), inputs.dim))
+        x = base.from_standard_normal(run.rng.standard_normal((min(run.left_at_all, size), simulator.inputs.dim)))
         try:
-            new_f = yield from run.simulator.evaluate(new_u)
+            f = yield from simulator.simulate(x)
         except Interrupted:
             stopped = True
             break
-        u, f = np.concatenate([u, new_u]), np.concatenate([f, new_f])
-        share = float((f <= goal.gamma).mean())
-        cov = binomial_cov(share, len(f))
-        run.simulator.record(float((new_f <= goal.gamma).mean()), share, len(new_f), cov)
-        if run.meets_target(cov):
+        draws.add(x, f)
+        hits, n = draws.counts
+        simulator.record(float((f <= goal.gamma).mean()), hits / n, len(f), binomial_cov(hits / n, n))
+        if run.meets_target(binomial_cov(hits / n, n)):
             break
-    if len(f) == 0:
-        u, f = state.base_u, state.base_f
-    n_before = len(f) - (run.simulator.n_sim - first)  # base draws of the exploration, its first simulations
-    fails = f <= goal.gamma
-    trace = run.simulator.close_trace()
-    outcome = Outcome.of_counts(int(fails.sum()), len(fails), goal.confidence, trace, no_outcome_share(f[fails]))
-    sample = Sample.of_equal_draws(f, inputs.base.from_standard_normal(u[fails]))
+    if draws.counts[1] == 0:
+        draws.add(explored, state.base_f)
+    n_new = simulator.n_sim - first
+    n_before = draws.counts[1] - n_new  # base draws of the exploration, its first simulations
+    outcome = draws.outcome(goal, simulator.close_trace())
+    parts = [(start, n) for start, n in ((0, n_before), (first, n_new)) if n]
     # A share of draws, but only in runs that came to this: it must not be pooled with others.
-    weights = tuple(
-        DrawWeights.of_equal_draws(len(f), start, n) for start, n in ((0, n_before), (first, len(f) - n_before)) if n
-    )
-    outcome = replace(outcome, sample=sample, counts=None, draw_weights=weights)
+    outcome = replace(outcome, counts=None, draw_weights=outcome.draw_weights[0].split(*parts))
     return replace(outcome, status=Status.STOPPED) if stopped else outcome
 
 
@@ -449,14 +447,6 @@ def _record_draws(run: SearchRun, batch: ComponentDraws, estimate: float, cov: f
 
 def _outcome(run: SearchRun, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
     """Return what weighted draws say of p."""
-    return Outcome(
-        p=draws.p,
-        interval=interval,
-        cov=cov,
-        status=Status.CONVERGED if len(draws.f) else Status.NO_HITS,
-        warnings=tuple(weight_warnings(draws)),
-        trace=run.simulator.close_trace(),
-        no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
-        base_draws=state.base_draws,
-        wide_draws=Sizes.within(run.budget).wide if len(state.base_f) else (),
-    )
+    outcome = draws.outcome(run.goal, Status.CONVERGED, run.simulator.close_trace(), 1.0, state.base_draws)
+    wide = Sizes.within(run.budget).wide if len(state.base_f) else ()
+    return replace(outcome, cov=cov, interval=interval, wide_draws=wide)

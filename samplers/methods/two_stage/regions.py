@@ -17,10 +17,6 @@ from samplers.methods.two_stage.settings import HIGH_DIM, REGIONS
 from samplers.problem import FloatArray
 from samplers.sample import PRIOR_SHARE, Interval, effective_sample_size, skewed_upper_end
 
-HITS_PER_LINEAGE = 4
-"""Wide failures that count as one lineage at least: draws of N(0, s^2 I) are independent, but reach some regions more
-often than others."""
-
 
 class Discovery(NamedTuple):
     """How thorough the search for regions was."""
@@ -53,7 +49,8 @@ def count_lineages(roots: int, wide_log_weights: FloatArray) -> float:
     `roots` distinct base draws have lines of descent, or paths of subset simulation, that came to a failure; the wide
     draws that failed have log(phi / q) (k,).
     """
-    return roots + max(effective_sample_size(wide_log_weights), len(wide_log_weights) / HITS_PER_LINEAGE)
+    # independent, but they reach some regions more often than others
+    return roots + max(effective_sample_size(wide_log_weights), len(wide_log_weights) / 4)
 
 
 def sampling_interval(

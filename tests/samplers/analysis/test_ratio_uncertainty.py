@@ -71,11 +71,12 @@ def test_one_that_never_fails_leaves_no_interval():
 
 def test_ratios_that_the_events_do_not_determine():
     log_p = np.stack([np.linspace(-20.0, -1.0, 30), np.full(30, -5.0)])
-    found = summarise_refits(2.0, 0.1, 0.95, BASE, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
+    sums = RefitSums(log_p, np.full((2, 30), 50.0))
+    found = summarise_refits(2.0, 0.1, 0.95, BASE, lambda: sums, is_ratio=True)
     assert found.interval is None
     assert found.spread == pytest.approx(log_p[0].std(ddof=1))
     assert "too few recorded events for limits of the ratio (standard deviation of its logarithm 5." in str(found)
     log_p[1, 3] = -np.inf
-    unknown = summarise_refits(2.0, 0.1, 0.95, BASE, RefitSums(log_p, np.full((2, 30), 50.0)), is_ratio=True)
+    unknown = summarise_refits(2.0, 0.1, 0.95, BASE, lambda: sums, is_ratio=True)
     assert unknown.reason.startswith("1 of 30 refits have no density")
     assert math.isnan(unknown.spread)
