@@ -8,7 +8,7 @@ Z ~ N(0, I) for the noise, p = E[P(f(X, Z) <= gamma | X)], and weights are those
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,15 +98,12 @@ class Simulator:
         return f
 
 
-_S = TypeVar("_S", bound=Simulator, covariant=True)
-
-
-@dataclass(frozen=True, eq=False)
-class RunContext(Generic[_S]):
-    """What is fixed for a run, and the simulator that counts."""
+@dataclass(eq=False)
+class SearchRun:
+    """What is fixed for a run, and the simulator that counts; the runs of a method have their draws beside it."""
 
     inputs: Inputs  # all of x
-    simulator: _S  # of the coordinates that are searched
+    simulator: Simulator  # of the coordinates that are searched
     goal: Goal
     budget: int  # simulations that the exploration and the rounds are planned for
     end: int  # simulations that are never exceeded; more than `budget` where only a target c.o.v. is given

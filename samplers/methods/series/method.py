@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from samplers.components import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, weighted_interval
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps, TermsOffer, offer_of, request_terms
-from samplers.methods.base import RunContext, SimulationSteps
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, offer_of, request_terms
+from samplers.methods.base import SearchRun, SimulationSteps
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.series import ROUNDS, WALKS
 from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
@@ -81,7 +81,10 @@ class Series(Method):
             raise ValueError(
                 "Series needs `terms` and `gradient` of the problem (see `samplers.Problem`); 'auto' does not."
             )
-        return search_terms(inputs, offer, goal, self.n if goal.max_sim is None else goal.max_sim, rng)
+        budget = self.n if goal.max_sim is None else goal.max_sim
+        open_ended = goal.max_sim is None and goal.target_cov is not None
+        end = budget + 100 * ROUNDS.target_batch if open_ended else budget
+        return SeriesRun(inputs, TermSimulator(inputs, offer, goal), goal, budget, end, rng).steps()
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,185 +162,160 @@ def order_by_terms(steps: Steps, gamma: float) -> Steps:
     return replace(outcome, sample=replace(outcome.sample, f=f, layers=()))
 
 
-SeriesRun = RunContext[TermSimulator]
+@dataclass(eq=False)
+class SeriesRun(SearchRun):
+    """A run with its draws so far, and the terms that are pursued."""
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SeriesState:
-    """Draws so far, and the terms that are pursued."""
-
-    history: TermHistory
-    n_base: int  # base draws before the walks, and ...
-    base_failures: int  # ... those of them that fail
-    base_draws: int  # in all
+    simulator: TermSimulator
+    history: TermHistory = field(init=False)
+    n_base: int = 0  # base draws before the walks, and ...
+    base_failures: int = 0  # ... those of them that fail
+    base_draws: int = 0  # in all
     pursued: tuple[PursuedTerm, ...] = ()
     finals: tuple[FinalRound, ...] = ()
     last_rate: float = 0.0  # effective failures for each draw of the last round
 
-
-def search_terms(inputs: Inputs, offer: TermsOffer, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
-    """Estimate P[f(X) <= goal.gamma] by terms and their gradients."""
-    open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + 100 * ROUNDS.target_batch if open_ended else budget
-    run = SeriesRun(inputs, TermSimulator(inputs, offer, goal), goal, budget, end, rng)
-    if budget < ROUNDS.min_budget:
-        outcome = yield from MonteCarlo(n=budget, batch=budget).steps(inputs, replace(goal, max_sim=end), rng)
-        about = f"{budget} simulations are too few for a search ({ROUNDS.min_budget}): base draws only."
-        return outcome.remark_first(about)
-    state = yield from _draw_base(run)
-    try:
-        base_rate = state.base_failures / state.n_base
-        if base_rate >= 0.1:  # plain Monte Carlo is as good as anything
-            return (yield from _run_monte_carlo(run, state))
-        state = yield from _walk(run, state)
-        state = yield from _run_rounds(run, state)
-        worthless = state.last_rate < max(ROUNDS.fallback_rate, base_rate)
-        if worthless and run.left >= 300:  # with fewer subset simulation is not worth it
-            return (yield from _fall_back(run, state))
-    except Interrupted:
-        return _estimate_early(run, state)
-    return (yield from _estimate(run, state))
-
-
-def _draw_base(run: SeriesRun) -> SimulationSteps[SeriesState]:
-    """Make the base draws."""
-    n, dim = min(max(int(ROUNDS.size * run.budget), 100), 2000), run.inputs.dim
-    u = run.rng.standard_normal((n, dim))
-    terms = yield from run.simulator.terms(u)
-    history = TermHistory(u, terms, np.full(n, np.log(n)), (IsotropicNormal(dim),), np.array([float(n)]), ((0, n),))
-    failures = int(history.failing(run.goal.gamma).sum())
-    run.simulator.record(failures / n, failures / n, n, binomial_cov(failures / n, n))
-    return SeriesState(history=history, n_base=n, base_failures=failures, base_draws=n)
-
-
-def _walk(run: SeriesRun, state: SeriesState) -> SimulationSteps[SeriesState]:
-    """Walk to the failures of main terms and of others; pursue those that are reached."""
-    terms, simulator = state.history.terms, run.simulator
-    term, rows = plan_walks(terms, run.budget, simulator.offer.count_gradients(1) + 1)
-    limit = simulator.n_sim + int(WALKS.budget_share * run.budget)
-    chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])
-    walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, run.goal.gamma, limit)
-    reached = float((walks.fallen >= 1).mean()) if len(rows) else 0.0
-    simulator.record(reached, simulator.trace[-1].estimate, len(rows), math.inf)
-    return replace(state, pursued=tuple(pursue_walked(walks)))
-
-
-def _run_rounds(run: SeriesRun, state: SeriesState) -> SimulationSteps[SeriesState]:
-    """Draw and refit until the failures of all terms are known, or the rest is for the estimate."""
-    size, kept = int(ROUNDS.size * run.budget), ROUNDS.final_share * run.budget
-    reserve = int((ROUNDS.final_share - ROUNDS.refit_share) * run.budget)
-    while not all(term.ready for term in state.pursued) and run.left - size >= kept:
-        state, _ = yield from _draw_round(run, state, size)
-        state = yield from _refit(run, state, reserve)
-    return state
-
-
-def _draw_round(
-    run: SeriesRun, state: SeriesState, n: int, final: bool = False
-) -> SimulationSteps[tuple[SeriesState, FinalRound]]:
-    """Draw n points from the present proposal; they join the history."""
-    gamma, simulator, first = run.goal.gamma, run.simulator, run.simulator.n_sim
-    components, shares = mix_terms(state.pursued, state.history, gamma, final)
-    counts = draw_counts(shares, n, run.rng)
-    u = draw_components(components, counts, run.rng)
-    terms = yield from simulator.terms(u)
-    log_weights = -mixture_log_ratio(log_ratios(components, u), shares)
-    draws = Draws.from_outcomes(terms.f, log_weights, run.inputs.base.from_standard_normal(u), gamma)
-    lost = ~np.isin(terms.least[draws.fails], [one.number for one in state.pursued]) | np.isneginf(draws.f)
-    other = float(np.exp(draws.log_weights[lost]).sum()) / n
-    y = np.zeros(n)
-    y[draws.fails] = np.exp(draws.log_weights)
-    drawn = FinalRound(draws, stratified_variance(y, counts), other, first)
-    history = state.history.add(u, terms, components, counts.astype(np.float64), first)
-    ess = draws.ess
-    simulator.record(len(draws.f) / n, draws.p, n, 1 / math.sqrt(ess) if ess else math.inf, ess)
-    base_draws = state.base_draws + int(counts[0])
-    return replace(state, history=history, base_draws=base_draws, last_rate=ess / n), drawn
-
-
-def _refit(run: SeriesRun, state: SeriesState, reserve: int) -> SimulationSteps[SeriesState]:
-    """Fit the proposals anew, leaving `reserve` simulations."""
-    limit, gamma = run.budget - reserve, run.goal.gamma
-    steps = refit_terms(run.simulator, state.history, state.pursued, gamma, limit, run.rng)
-    return replace(state, pursued=(yield from steps))
-
-
-def _estimate(run: SeriesRun, state: SeriesState) -> Steps:
-    """Make the final rounds; with a target c.o.v. end when it is met, or draw further batches until then."""
-    goal, stopped, number, planned = run.goal, False, 0, len(ROUNDS.final_sizes)
-    room = run.left - int((planned - 1) * ROUNDS.refit_share * run.budget)
-    sizes = [int(share * room) for share in ROUNDS.final_sizes]
-    while number < planned or (goal.target_cov is not None and run.left_at_all > 0):
-        if number and run.meets_target(combine_rounds(state.finals).cov):
-            break
+    def steps(self) -> Steps:
+        """Walk, draw and refit, estimate."""
+        budget = self.budget
+        if budget < ROUNDS.min_budget:
+            goal = replace(self.goal, max_sim=self.end)
+            outcome = yield from MonteCarlo(n=budget, batch=budget).steps(self.inputs, goal, self.rng)
+            about = f"{budget} simulations are too few for a search ({ROUNDS.min_budget}): base draws only."
+            return outcome.remark_first(about)
+        yield from self._draw_base()
         try:
-            if 0 < number < planned:
-                state = yield from _refit(run, state, sum(sizes[number:]))
-            size = run.left if number == planned - 1 else sizes[number] if number < planned else ROUNDS.target_batch
-            state, drawn = yield from _draw_round(run, state, min(size, run.left_at_all), final=True)
+            base_rate = self.base_failures / self.n_base
+            if base_rate >= 0.1:  # plain Monte Carlo is as good as anything; those made so far decided on it
+                left, batch = self.left_at_all, 10_000 if self.goal.target_cov is None else ROUNDS.target_batch
+                goal = replace(self.goal, max_sim=left)
+                plain = MonteCarlo(n=left, batch=batch).steps(self.inputs, goal, self.rng)
+                return (yield from self._leave_rest(plain))
+            yield from self._walk()
+            # draw and refit until the failures of all terms are known, or the rest is for the estimate
+            size, kept = int(ROUNDS.size * budget), ROUNDS.final_share * budget
+            while not all(term.ready for term in self.pursued) and self.left - size >= kept:
+                yield from self._draw_round(size)
+                yield from self._refit(int((ROUNDS.final_share - ROUNDS.refit_share) * budget))
+            worthless = self.last_rate < max(ROUNDS.fallback_rate, base_rate)
+            if worthless and self.left >= 300:  # with fewer subset simulation is not worth it
+                return (yield from self._leave_rest(self._descend()))
         except Interrupted:
-            stopped = True
-            break
-        drawn = replace(drawn, factor=ROUNDS.final_weights[min(number, planned - 1)])
-        state, number = replace(state, finals=(*state.finals, drawn)), number + 1
-    return _conclude(run, state, stopped) if state.finals else _estimate_early(run, state)
+            return self._estimate_early()
+        return (yield from self._estimate())
 
+    def _draw_base(self) -> SimulationSteps[None]:
+        """Make the base draws."""
+        n, dim = min(max(int(ROUNDS.size * self.budget), 100), 2000), self.inputs.dim
+        u = self.rng.standard_normal((n, dim))
+        terms, components = (yield from self.simulator.terms(u)), (IsotropicNormal(dim),)
+        self.history = TermHistory(u, terms, np.full(n, np.log(n)), components, np.array([float(n)]), ((0, n),))
+        self.n_base = self.base_draws = n
+        self.base_failures = int(self.history.failing(self.goal.gamma).sum())
+        share = self.base_failures / n
+        self.simulator.record(share, share, n, binomial_cov(share, n))
 
-def _conclude(run: SeriesRun, state: SeriesState, stopped: bool) -> Outcome:
-    """Return the outcome of the final rounds."""
-    rounds, confidence = state.finals, run.goal.confidence
-    c, parts, draws, cov = combine_rounds(rounds)
-    status = Status.STOPPED if stopped else Status.CONVERGED
-    largest = float((c * draws.n / [part.n for part in parts]).max()) / ROUNDS.base_share
-    outcome = draws.outcome(run.goal, status, run.simulator.close_trace(), largest, state.base_draws)
-    ceiling = clopper_pearson(state.base_failures, state.n_base, confidence)[1]  # no proposal has chosen these draws
-    warnings = [*outcome.warnings]
-    other = float(c @ [one.other for one in rounds]) / max(draws.p, np.finfo(np.float64).tiny)
-    if other > 0.05:
-        warnings.append(f"{100 * other:.0f} % of p comes from terms without a proposal of their own.")
-    return replace(
-        outcome,
-        cov=cov,
-        interval=weighted_interval(draws, confidence, largest, cov, ceiling),
-        warnings=tuple(warnings),
-        draw_weights=sum((part.weights_after(one.first, draws.n) for part, one in zip(parts, rounds, strict=True)), ()),
-    )
+    def _walk(self) -> SimulationSteps[None]:
+        """Walk to the failures of main terms and of others; pursue those that are reached."""
+        terms, simulator = self.history.terms, self.simulator
+        term, rows = plan_walks(terms, self.budget, simulator.offer.count_gradients(1) + 1)
+        limit = simulator.n_sim + int(WALKS.budget_share * self.budget)
+        chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])
+        walks = yield from walk_downhill(simulator, self.history.u[rows], chosen, term, self.goal.gamma, limit)
+        reached = float((walks.fallen >= 1).mean()) if len(rows) else 0.0
+        simulator.record(reached, simulator.trace[-1].estimate, len(rows), math.inf)
+        self.pursued = tuple(pursue_walked(walks))
 
+    def _draw_round(self, n: int, final: bool = False) -> SimulationSteps[FinalRound]:
+        """Draw n points from the present proposal; they join the history."""
+        gamma, simulator, first = self.goal.gamma, self.simulator, self.simulator.n_sim
+        components, shares = mix_terms(self.pursued, self.history, gamma, final)
+        counts = draw_counts(shares, n, self.rng)
+        u = draw_components(components, counts, self.rng)
+        terms = yield from simulator.terms(u)
+        log_weights = -mixture_log_ratio(log_ratios(components, u), shares)
+        draws = Draws.from_outcomes(terms.f, log_weights, self.inputs.base.from_standard_normal(u), gamma)
+        lost = ~np.isin(terms.least[draws.fails], [one.number for one in self.pursued]) | np.isneginf(draws.f)
+        other = float(np.exp(draws.log_weights[lost]).sum()) / n
+        y, ess = np.zeros(n), draws.ess
+        y[draws.fails] = np.exp(draws.log_weights)
+        self.history = self.history.add(u, terms, components, counts.astype(np.float64), first)
+        simulator.record(len(draws.f) / n, draws.p, n, 1 / math.sqrt(ess) if ess else math.inf, ess)
+        self.base_draws, self.last_rate = self.base_draws + int(counts[0]), ess / n
+        return FinalRound(draws, stratified_variance(y, counts), other, first)
 
-def _estimate_early(run: SeriesRun, state: SeriesState) -> Outcome:
-    """Return what all draws from known proposals say, for a run that ends before its estimate."""
-    history, largest = state.history, len(state.history.u) / state.n_base
-    x = run.inputs.base.from_standard_normal(history.u)
-    draws = Draws.from_outcomes(history.terms.f, history.log_weights + math.log(len(x)), x, run.goal.gamma)
-    outcome = draws.outcome(run.goal, Status.STOPPED, run.simulator.close_trace(), largest, state.base_draws)
-    weights = DrawWeights(first=0, log_weights=history.log_weights)
-    return replace(outcome, draw_weights=weights.split(*history.batches))
+    def _refit(self, reserve: int) -> SimulationSteps[None]:
+        """Fit the proposals anew, leaving `reserve` simulations."""
+        limit, gamma = self.budget - reserve, self.goal.gamma
+        self.pursued = yield from refit_terms(self.simulator, self.history, self.pursued, gamma, limit, self.rng)
 
+    def _estimate(self) -> Steps:
+        """Make the final rounds; with a target c.o.v. end when it is met, or draw further batches until then."""
+        stopped, number, planned = False, 0, len(ROUNDS.final_sizes)
+        room = self.left - int((planned - 1) * ROUNDS.refit_share * self.budget)
+        sizes = [int(share * room) for share in ROUNDS.final_sizes[:-1]]
+        last = int(ROUNDS.final_sizes[-1] * room)
+        while number < planned or (self.goal.target_cov is not None and self.left_at_all > 0):
+            if number and self.meets_target(combine_rounds(self.finals).cov):
+                break
+            try:
+                if 0 < number < planned:
+                    yield from self._refit(sum(sizes[number:]) + last)
+                further = self.left if number == planned - 1 else ROUNDS.target_batch
+                size = sizes[number] if number < planned - 1 else further
+                drawn = yield from self._draw_round(min(size, self.left_at_all), final=True)
+            except Interrupted:
+                stopped = True
+                break
+            self.finals += (replace(drawn, factor=ROUNDS.final_weights[min(number, planned - 1)]),)
+            number += 1
+        return self._conclude(stopped) if self.finals else self._estimate_early()
 
-def _run_monte_carlo(run: SeriesRun, state: SeriesState) -> Steps:
-    """Spend the rest on base draws; those made so far decided on this and do not count."""
-    left = run.left_at_all
-    method = MonteCarlo(n=left, batch=10_000 if run.goal.target_cov is None else ROUNDS.target_batch)
-    return _after(run, state, (yield from method.steps(run.inputs, replace(run.goal, max_sim=left), run.rng)))
+    def _conclude(self, stopped: bool) -> Outcome:
+        """Return the outcome of the final rounds."""
+        rounds, confidence = self.finals, self.goal.confidence
+        c, parts, draws, cov = combine_rounds(rounds)
+        status = Status.STOPPED if stopped else Status.CONVERGED
+        largest = float((c * draws.n / [part.n for part in parts]).max()) / ROUNDS.base_share
+        outcome = draws.outcome(self.goal, status, self.simulator.close_trace(), largest, self.base_draws)
+        ceiling = clopper_pearson(self.base_failures, self.n_base, confidence)[1]  # no proposal has chosen these draws
+        other = float(c @ [one.other for one in rounds]) / max(draws.p, np.finfo(np.float64).tiny)
+        about = [f"{100 * other:.0f} % of p comes from terms without a proposal of their own."] * (other > 0.05)
+        weights = [part.weights_after(one.first, draws.n) for part, one in zip(parts, rounds, strict=True)]
+        return replace(
+            outcome,
+            cov=cov,
+            interval=weighted_interval(draws, confidence, largest, cov, ceiling),
+            warnings=(*outcome.warnings, *about),
+            draw_weights=sum(weights, ()),
+        )
 
+    def _estimate_early(self) -> Outcome:
+        """Return what all draws from known proposals say, for a run that ends before its estimate."""
+        history, largest = self.history, len(self.history.u) / self.n_base
+        x = self.inputs.base.from_standard_normal(history.u)
+        draws = Draws.from_outcomes(history.terms.f, history.log_weights + math.log(len(x)), x, self.goal.gamma)
+        outcome = draws.outcome(self.goal, Status.STOPPED, self.simulator.close_trace(), largest, self.base_draws)
+        weights = DrawWeights(first=0, log_weights=history.log_weights)
+        return replace(outcome, draw_weights=weights.split(*history.batches))
 
-def _fall_back(run: SeriesRun, state: SeriesState) -> Steps:
-    """Spend the rest on subset simulation in the order of the terms, with six levels if nothing is known."""
-    left, gamma = run.left_at_all, run.goal.gamma
-    p = min(float(np.exp(state.history.log_weights[state.history.failing(gamma)]).sum()), 1.0)
-    levels = min(math.ceil(-math.log10(p)), 6) if p > 0 else 6
-    steps = spend_on_subset_simulation(run.inputs, replace(run.goal, max_sim=left), levels, left, None, run.rng)
-    return _after(run, state, (yield from order_by_terms(steps, gamma)))
+    def _descend(self) -> Steps:
+        """Run subset simulation in the order of the terms, with six levels if nothing is known."""
+        left, gamma = self.left_at_all, self.goal.gamma
+        p = min(float(np.exp(self.history.log_weights[self.history.failing(gamma)]).sum()), 1.0)
+        levels = min(math.ceil(-math.log10(p)), 6) if p > 0 else 6
+        goal = replace(self.goal, max_sim=left)
+        return order_by_terms(spend_on_subset_simulation(self.inputs, goal, levels, left, None, self.rng), gamma)
 
-
-def _after(run: SeriesRun, state: SeriesState, outcome: Outcome) -> Outcome:
-    """Return the outcome of another method that used the rest."""
-    earlier = run.simulator.close_trace()
-    spent = sum(level.n_sim for level in earlier)
-    return replace(
-        outcome,
-        trace=(*earlier, *outcome.trace),
-        base_draws=state.base_draws + outcome.base_draws,
-        counts=None,
-        draw_weights=tuple(replace(weights, first=weights.first + spent) for weights in outcome.draw_weights),
-    )
+    def _leave_rest(self, steps: Steps) -> Steps:
+        """Leave the rest to another method; return its outcome as that of the whole run."""
+        outcome = yield from steps
+        earlier = self.simulator.close_trace()
+        spent = sum(level.n_sim for level in earlier)
+        return replace(
+            outcome,
+            trace=(*earlier, *outcome.trace),
+            base_draws=self.base_draws + outcome.base_draws,
+            counts=None,
+            draw_weights=tuple(replace(weights, first=weights.first + spent) for weights in outcome.draw_weights),
+        )

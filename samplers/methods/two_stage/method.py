@@ -12,7 +12,7 @@ from samplers.mcmc import RootedPoints
 from samplers.method import Goal, Interrupted, Method, Outcome, Steps
 from samplers.methods.base import (
     ComponentDraws,
-    RunContext,
+    SearchRun,
     SimulationSteps,
     Simulator,
     marginalise_noise,
@@ -39,7 +39,7 @@ from samplers.methods.two_stage.stratified import (
     check_rounds,
     describe_discovery,
 )
-from samplers.problem import FloatArray, Inputs, check_settings
+from samplers.problem import Inputs, check_settings
 from samplers.sample import Interval, Status, add_unseen, binomial_cov, effective_sample_size
 
 
@@ -127,326 +127,295 @@ class TwoStage(Method):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
-        return run_two_stage(inputs, goal, self.n if goal.max_sim is None else goal.max_sim, rng)
+        budget = self.n if goal.max_sim is None else goal.max_sim
+        open_ended = goal.max_sim is None and goal.target_cov is not None
+        end = budget + MOST_BATCHES * (budget // TARGET_BATCHES) if open_ended else budget
+        simulator = Simulator(marginalise_noise(inputs, rng), goal)  # noise that is part of x is left to chance
+        return TwoStageRun(inputs, simulator, goal, budget, end, rng).steps()
 
 
 TARGET_BATCHES, MOST_BATCHES = 10, 100
 """With a target c.o.v. the budget over the first is a batch of the estimate; the second is the most of them."""
 LEAST_FALLBACK = 300
 """Simulations under which subset simulation is not worth it."""
-SearchRun = RunContext[Simulator]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RunState:
-    """Draws of a run so far."""
+@dataclass(eq=False)
+class TwoStageRun(SearchRun):
+    """A run with its draws so far, what is known of the regions, and the proposal for the next draws."""
 
-    history: MultipleImportanceSample
-    """All draws from known components."""
-    base_u: FloatArray
-    """Base draws of the exploration, shape (n0, d)."""
-    base_f: FloatArray
-    """Their outcomes, shape (n0,)."""
+    refinement: RefinementState = field(init=False)
+    proposal: MixtureProposal = field(init=False)
     base_draws: int = 0
     """Base draws in all: of a proposal those of its first component."""
     rounds: tuple[Draws, ...] = ()
     """Draws of the rounds, each weighted as draws of its own proposal."""
-    last_u: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """The failing ones of the last round, shape (k, d)."""
     counted: tuple[tuple[StratifiedSample, int], ...] = ()
     """Those of the rounds that count in p, and the simulations before them."""
 
-    def base_share(self, gamma: float) -> float:
-        """Return the share of the base draws with f <= gamma."""
-        return float((self.base_f <= gamma).mean())
+    def __post_init__(self) -> None:
+        """Begin without draws."""
+        dim = self.simulator.inputs.dim
+        self.history = MultipleImportanceSample.empty(dim)  # all draws from known components
+        self.base_u, self.base_f = np.empty((0, dim)), np.empty(0)  # base draws of the exploration
+        self.last_u = np.empty((0, dim))  # failing draws of the last round
 
+    @property
+    def base_share(self) -> float:
+        """Share of the base draws with f <= gamma."""
+        return float((self.base_f <= self.goal.gamma).mean())
 
-def run_two_stage(inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator) -> Steps:
-    """Estimate P[f(X) <= goal.gamma] with a budget that need not be the goal's."""
-    open_ended = goal.max_sim is None and goal.target_cov is not None
-    end = budget + MOST_BATCHES * (budget // TARGET_BATCHES) if open_ended else budget
-    searched = marginalise_noise(inputs, rng)  # noise that is part of x is left to chance
-    run = RunContext(inputs, Simulator(searched, goal), goal, budget, end, rng)
-    nothing = np.empty((0, searched.dim))
-    state = RunState(history=MultipleImportanceSample.empty(searched.dim), base_u=nothing, base_f=np.empty(0))
-    if budget < BUDGET.least:
-        about = f"max_sim leaves {budget} simulations, too few for an exploration ({BUDGET.least}): base draws only."
-        return (yield from _run_monte_carlo(run, state)).remark_first(about)
-    try:
-        state = yield from _draw_first(run, state)
-        if state.base_share(goal.gamma) >= BUDGET.common_share:
-            return (yield from _run_monte_carlo(run, state, counted=False))
-        exploration = yield from _explore(run, state)
-        if not exploration.regions:
-            return (yield from _run_monte_carlo(run, state))
-        if exploration.is_shell and run.left_at_all >= LEAST_FALLBACK:
-            return (yield from _fall_back(run, state, exploration.levels))
-        refinement = start_refinement(exploration, goal.gamma, rng)
-        proposal = build_proposal(refinement, state.history)
-        room, number, final = run.left, 0, False
-        while not final:
-            number += 1
-            steps = _refine(run, state, refinement, number, room, proposal)
-            state, refinement, proposal, final = yield from steps
-            if _gives_up(run, state, refinement, proposal, number, final=final):
-                return (yield from _fall_back(run, state, exploration.levels))
-    except Interrupted:
-        if not state.history.batches:  # nothing is known yet
-            raise
-        return _estimate_early(run, state)
-    outcome = yield from _estimate(run, state, refinement, proposal)
-    if budget >= BUDGET.sufficient:
-        return outcome
-    about = f"A search of {budget:,} simulations misses one of two equal regions in up to 30 % of runs"
-    return outcome.remark_first(f"{about}; {BUDGET.sufficient:,} are recommended.")
+    def steps(self) -> Steps:
+        """Explore, refine, estimate."""
+        if self.budget < BUDGET.least:
+            about = f"max_sim leaves {self.budget} simulations, too few for an exploration ({BUDGET.least})"
+            return (yield from self._run_monte_carlo()).remark_first(f"{about}: base draws only.")
+        try:
+            yield from self._draw_first()
+            if self.base_share >= BUDGET.common_share:
+                return (yield from self._run_monte_carlo(counted=False))
+            exploration = yield from self._explore()
+            if not exploration.regions:
+                return (yield from self._run_monte_carlo())
+            if exploration.is_shell and self.left_at_all >= LEAST_FALLBACK:
+                return (yield from self._fall_back(exploration.levels))
+            self.refinement = start_refinement(exploration, self.goal.gamma, self.rng)
+            self.proposal = build_proposal(self.refinement, self.history)
+            room, number, final = self.left, 0, False
+            while not final:
+                number += 1
+                final = yield from self._refine(number, room)
+                if self._gives_up(number, final=final):
+                    return (yield from self._fall_back(exploration.levels))
+        except Interrupted:
+            if not self.history.batches:  # nothing is known yet
+                raise
+            return self._estimate_early()
+        outcome = yield from self._estimate()
+        if self.budget >= BUDGET.sufficient:
+            return outcome
+        about = f"A search of {self.budget:,} simulations misses one of two equal regions in up to 30 % of runs"
+        return outcome.remark_first(f"{about}; {BUDGET.sufficient:,} are recommended.")
 
+    def _draw_first(self) -> SimulationSteps[None]:
+        """Make the base draws and the wide draws of the exploration."""
+        sizes = Sizes.within(self.budget)
+        first = yield from draw_isotropic(self.simulator, ((1.0, sizes.base), *sizes.wide), self.rng)
+        self.history = self.history.add(first, self.goal.gamma)
+        self.base_u, self.base_f, self.base_draws = first.u[: sizes.base], first.f[: sizes.base], sizes.base
+        self.simulator.record(self.base_share, self.base_share, len(first.f), binomial_cov(self.base_share, sizes.base))
 
-def _draw_first(run: SearchRun, state: RunState) -> SimulationSteps[RunState]:
-    """Make the base draws and the wide draws of the exploration."""
-    gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
-    first = yield from draw_isotropic(run.simulator, ((1.0, sizes.base), *sizes.wide), run.rng)
-    state = replace(
-        state,
-        history=state.history.add(first, gamma),
-        base_u=first.u[: sizes.base],
-        base_f=first.f[: sizes.base],
-        base_draws=sizes.base,
-    )
-    share = state.base_share(gamma)
-    run.simulator.record(share, share, len(first.f), binomial_cov(share, sizes.base))
-    return state
+    def _explore(self) -> SimulationSteps[ExplorationResult]:
+        """Find the failure regions, starting from the first draws; there are none if nothing fails."""
+        gamma, first = self.goal.gamma, self.history.batches[0]
+        exploration = yield from find_regions(self.simulator, first, self.goal, Sizes.within(self.budget), self.rng)
+        slopes = yield from find_slopes(self.simulator, exploration, gamma, self.left, self.rng)
+        n = sum(len(region.f) for region in exploration.regions)
+        fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
+        self.simulator.record(fails / max(n, 1), self.base_share, n, math.inf)
+        return exploration._replace(slopes=slopes)
 
+    def _refine(self, number: int, room: int) -> SimulationSteps[bool]:
+        """Make one round of refinement, and the proposal that follows from it; return whether that is the last one."""
+        shares = (*PROPOSAL.round_shares, *PROPOSAL.further_shares)
+        n = int(shares[number - 1] * room)
+        if n > 0:
+            yield from self._draw_round(n)
+        if number == 1 and n > 0 and not self.refinement.exploration.noisy:
+            yield from self._look_for_noise()
+        described = 1.0
+        if self.rounds:
+            described = least_described(self.refinement, self.last_u, self.rounds[-1].log_weights)
+        enough = number >= len(PROPOSAL.round_shares) and described >= PROPOSAL.described
+        final = number == len(shares) or enough
+        self.proposal = build_proposal(self.refinement, self.history, final=final)
+        return final
 
-def _explore(run: SearchRun, state: RunState) -> SimulationSteps[ExplorationResult]:
-    """Find the failure regions, starting from the first draws; there are none if nothing fails."""
-    gamma, sizes = run.goal.gamma, Sizes.within(run.budget)
-    exploration = yield from find_regions(run.simulator, state.history.batches[0], run.goal, sizes, run.rng)
-    slopes = yield from find_slopes(run.simulator, exploration, gamma, run.left, run.rng)
-    n = sum(len(region.f) for region in exploration.regions)
-    fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
-    run.simulator.record(fails / max(n, 1), state.base_share(gamma), n, math.inf)
-    return exploration._replace(slopes=slopes)
+    def _draw_round(self, n: int) -> SimulationSteps[None]:
+        """Draw n points from the proposal and learn from them."""
+        proposal, gamma, inputs = self.proposal, self.goal.gamma, self.simulator.inputs
+        batch = yield from self._draw(n)
+        # The proposals of the first two rounds may not describe the failures; base draws that fail do not count in p.
+        common = np.count_nonzero(self.base_f <= gamma) >= EXPLORATION.common_failures
+        if len(self.rounds) >= 2 - int(common):
+            empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0))
+            self.counted += ((empty.add(batch, proposal, inputs, gamma), batch.first),)
+        self.rounds += (Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma),)
+        self.history = self.history.add(batch._replace(x=None), gamma)
+        self.refinement = refine_once(self.refinement, self.history, proposal, batch, self.rng)
+        self.last_u = batch.u[batch.f <= gamma]
+        ess = effective_sample_size(self.history.log_weights)
+        p = float(np.exp(self.history.log_weights).sum())
+        self._record_draws(batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess)
 
+    def _look_for_noise(self) -> SimulationSteps[None]:
+        """Look for noise beside the failures that weigh most; with noise, begin anew with all regions as one.
 
-def _refine(
-    run: SearchRun, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
-) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
-    """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one."""
-    shares = (*PROPOSAL.round_shares, *PROPOSAL.further_shares)
-    n = int(shares[number - 1] * room)
-    if n > 0:
-        state, refinement = yield from _draw_round(run, state, refinement, proposal, n)
-    if number == 1 and n > 0 and not refinement.exploration.noisy:
-        refinement = yield from _look_for_noise(run, state, refinement)
-    described = least_described(refinement, state.last_u, state.rounds[-1].log_weights) if state.rounds else 1.0
-    enough = number >= len(PROPOSAL.round_shares) and described >= PROPOSAL.described
-    final = number == len(shares) or enough
-    return state, refinement, build_proposal(refinement, state.history, final=final), final
+        Noise matters where failures are likely, near the origin; chains may be deep inside the failure region.
+        """
+        heaviest = np.argsort(-self.history.log_weights, kind="stable")[:20]
+        if len(heaviest) < 20:
+            return
+        if (yield from is_noisy(self.simulator, self.history.u[heaviest], self.goal.gamma, self.rng)):
+            known = self.refinement.exploration
+            whole = Region(*(np.concatenate(parts) for parts in zip(*known.regions, strict=True)))
+            discovery = known.discovery._replace(regions=1)
+            found = ExplorationResult([whole], noisy=True, levels=known.levels, discovery=discovery)
+            self.refinement = start_refinement(found, self.goal.gamma, self.rng)
 
+    def _gives_up(self, number: int, *, final: bool) -> bool:
+        """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last.
 
-def _draw_round(
-    run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
-) -> SimulationSteps[tuple[RunState, RefinementState]]:
-    """Draw n points from a proposal and learn from them."""
-    state, batch = yield from _draw(run, state, proposal, n)
-    gamma = run.goal.gamma
-    # The proposals of the first two rounds may not describe the failures; base draws that fail do not count in p.
-    common = np.count_nonzero(state.base_f <= gamma) >= EXPLORATION.common_failures
-    if len(state.rounds) >= 2 - int(common):
-        inputs = run.simulator.inputs
-        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0))
-        counted = empty.add(batch, proposal, inputs, gamma), batch.first
-        state = replace(state, counted=(*state.counted, counted))
-    draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
-    history = state.history.add(batch._replace(x=None), gamma)
-    refinement = refine_once(refinement, history, proposal, batch, run.rng)
-    ess = effective_sample_size(history.log_weights)
-    p = float(np.exp(history.log_weights).sum())
-    _record_draws(run, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess)
-    last_u = batch.u[batch.f <= gamma]
-    return replace(state, history=history, rounds=(*state.rounds, draws), last_u=last_u), refinement
+        It does if the draws meet too few failures, or if the proposal is far from most of the regions found.
+        """
+        refinement = self.refinement
+        if self.left_at_all < LEAST_FALLBACK or not self.rounds:
+            return False
+        if refinement.exploration.noisy and not (final and self.simulator.inputs is not self.inputs):
+            return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
+        last, early = self.rounds[-1], FALLBACK.early_rates
+        late = FALLBACK.late_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
+        rate = early[number - 1] if number <= len(early) else late
+        # One heavy draw leaves a round few effective failures; all rounds together may have many.
+        worth = max(last.ess, effective_sample_size(self.history.log_weights))
+        # Draws within the span of slopes leave few places out: the weights met are about as uneven as all of them.
+        if worth < (0.25 if refinement.within is not None else 1.0) * rate * last.n:
+            return True
+        # Ends of lines in a ring are no typical failures.
+        described = refinement.exploration.noisy or refinement.within is not None
+        if not final or described or last.ess >= PROPOSAL.good_rate * last.n:
+            return False
+        typical = typical_weights(refinement, self.proposal, self.history)
+        return float(np.median(typical)) > FALLBACK.max_typical * last.p
 
+    def _fall_back(self, levels: int) -> Steps:
+        """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
+        known: RootedPoints | None = RootedPoints(self.base_u, self.base_f, np.arange(len(self.base_f)))
+        if self.simulator.inputs is not self.inputs:  # the base draws lack the coordinates of noise
+            known = None
+        trace, before = self.simulator.close_trace(), self._estimate_early()
+        steps = spend_on_subset_simulation(self.inputs, self.goal, levels, self.left_at_all, known, self.rng)
+        whole = outcome = yield from steps
+        if outcome.status is Status.STOPPED and outcome.p == 0:  # no estimate, then
+            whole = before
+        elif before.interval[0] > outcome.p:  # wide draws also find regions that f does not announce: it holds both
+            (low, high), (other_low, other_high) = before.interval, outcome.interval
+            missed = "Subset simulation, which took over, missed failure regions found before"
+            whole = replace(
+                before,
+                interval=(min(low, other_low), max(high, other_high)),
+                status=outcome.status,
+                warnings=(*before.warnings, *outcome.warnings, f"{missed}; it gives {outcome.p:.1e}."),
+                remarks=(*before.remarks, *outcome.remarks),
+            )
+        drawn = self.base_draws + outcome.base_draws
+        return replace(whole, trace=trace + outcome.trace, base_draws=drawn, wide_draws=before.wide_draws)
 
-def _look_for_noise(run: SearchRun, state: RunState, refinement: RefinementState) -> SimulationSteps[RefinementState]:
-    """Look for noise beside the failures that weigh most; with noise, begin anew with all regions as one.
+    def _estimate(self) -> Steps:
+        """Draw from the last proposal until the budget is used or the target is met.
 
-    Noise matters where failures are likely, near the origin; chains may be deep inside the failure region.
-    """
-    heaviest = np.argsort(-state.history.log_weights, kind="stable")[:20]
-    if len(heaviest) < 20:
-        return refinement
-    if not (yield from is_noisy(run.simulator, state.history.u[heaviest], run.goal.gamma, run.rng)):
-        return refinement
-    known = refinement.exploration
-    whole = Region(*(np.concatenate(parts) for parts in zip(*known.regions, strict=True)))
-    found = ExplorationResult([whole], noisy=True, levels=known.levels, discovery=known.discovery._replace(regions=1))
-    return start_refinement(found, run.goal.gamma, run.rng)
+        p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
+        """
+        goal, inputs, proposal, stopped = self.goal, self.simulator.inputs, self.proposal, False
+        typical = typical_weights(self.refinement, proposal, self.history)
+        whole = sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
+        size = self.left if goal.target_cov is None else self._target_batch
+        while self.left_at_all > 0:
+            try:
+                batch = yield from self._draw(min(size, self.left_at_all))
+            except Interrupted:
+                stopped = True
+                break
+            sample = sample.add(batch, proposal, inputs, goal.gamma)
+            whole = reduce(StratifiedSample.join, (each for each, _ in self.counted), sample)
+            self._record_draws(batch, whole.p, whole.cov, whole.draws.ess)
+            if self.meets_target(whole.cov):
+                break
+        if sample.draws.n == 0:
+            early = self._estimate_early()
+            return early if stopped else replace(early, status=Status.BUDGET)
+        outcome = self._conclude(sample, whole)
+        return replace(outcome, status=Status.STOPPED) if stopped else outcome
 
-
-def _gives_up(
-    run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal, number: int, *, final: bool
-) -> bool:
-    """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last.
-
-    It does if the draws meet too few failures, or if the proposal is far from most of the regions found.
-    """
-    if run.left_at_all < LEAST_FALLBACK or not state.rounds:
-        return False
-    if refinement.exploration.noisy and not (final and run.simulator.inputs is not run.inputs):
-        return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
-    last, early = state.rounds[-1], FALLBACK.early_rates
-    late = FALLBACK.late_rate / max(refinement.exploration.levels, FEWEST_LEVELS)
-    rate = early[number - 1] if number <= len(early) else late
-    # One heavy draw leaves a round few effective failures; all rounds together may have many.
-    worth = max(last.ess, effective_sample_size(state.history.log_weights))
-    # Draws within the span of slopes leave few places out: the weights met are about as uneven as all of them.
-    if worth < (0.25 if refinement.within is not None else 1.0) * rate * last.n:
-        return True
-    # Ends of lines in a ring are no typical failures.
-    described = refinement.exploration.noisy or refinement.within is not None
-    doubtful = final and not described and last.ess < PROPOSAL.good_rate * last.n
-    if not doubtful:
-        return False
-    typical = typical_weights(refinement, proposal, state.history)
-    return float(np.median(typical)) > FALLBACK.max_typical * last.p
-
-
-def _fall_back(run: SearchRun, state: RunState, levels: int) -> Steps:
-    """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
-    known: RootedPoints | None = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
-    if run.simulator.inputs is not run.inputs:  # the base draws lack the coordinates of noise
-        known = None
-    trace, before = run.simulator.close_trace(), _estimate_early(run, state)
-    outcome = yield from spend_on_subset_simulation(run.inputs, run.goal, levels, run.left_at_all, known, run.rng)
-    whole = outcome
-    if outcome.status is Status.STOPPED and outcome.p == 0:  # no estimate, then
-        whole = before
-    elif before.interval[0] > outcome.p:  # wide draws also find regions that f does not announce: it is to hold both
-        (low, high), (other_low, other_high) = before.interval, outcome.interval
-        about = f"Subset simulation, which took over, missed failure regions found before; it gives {outcome.p:.1e}."
-        whole = replace(
-            before,
-            interval=(min(low, other_low), max(high, other_high)),
-            status=outcome.status,
-            warnings=(*before.warnings, *outcome.warnings, about),
-            remarks=(*before.remarks, *outcome.remarks),
+    def _conclude(self, sample: StratifiedSample, whole: StratifiedSample) -> Outcome:
+        """Return what the draws of the last proposal, and all that count, say."""
+        discovery, confidence, gamma = self.refinement.exploration.discovery, self.goal.confidence, self.goal.gamma
+        low, high = sampling_interval(whole.draws, whole.cov, confidence, whole.largest_weight, discovery)
+        raised = add_unseen(whole.p, high, discovery.lineages, confidence)
+        outcome = self._outcome(whole.draws, whole.cov, (low, raised))
+        points = sample.to_sample(self.proposal, self.base_f, self.base_u, gamma, whole.draws)
+        parts = (*self.counted, (sample, self.simulator.n_sim - sample.draws.n))
+        hits = int((self.base_f <= gamma).sum())
+        doubts = (*check_base_draws(whole.p, hits, len(self.base_f)), *check_rounds(sample, self.rounds))
+        return replace(
+            outcome,
+            warnings=(*outcome.warnings, *doubts, *check_regions(whole)),
+            remarks=(*outcome.remarks, *describe_discovery(whole.p, high, raised, discovery, confidence)),
+            sample=replace(points, lineages=discovery.lineages),
+            draw_weights=tuple(w for part, first in parts for w in part.draws.weights_after(first, whole.draws.n)),
         )
-    drawn = state.base_draws + outcome.base_draws
-    return replace(whole, trace=trace + outcome.trace, base_draws=drawn, wide_draws=before.wide_draws)
 
+    def _estimate_early(self) -> Outcome:
+        """Return what all draws from known components say, for a run that ends before its estimate."""
+        u, f, log_weights = self.history.all_draws()
+        x = self.simulator.inputs.base.from_standard_normal(u)
+        draws = Draws.from_outcomes(f, log_weights + math.log(len(f)), x, self.goal.gamma)
+        largest_weight = draws.n / max(len(self.base_f), 1)
+        interval = weighted_interval(draws, self.goal.confidence, largest_weight, draws.cov)
+        outcome = self._outcome(draws, draws.cov, interval)
+        parts = [(batch.first, len(batch.f)) for batch in self.history.batches]
+        weights = tuple(part for each in draws.weights_after(0) for part in each.split(*parts))
+        return replace(outcome, draw_weights=weights, status=Status.STOPPED)
 
-def _estimate(run: SearchRun, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:
-    """Draw from the last proposal until the budget is used or the target is met.
+    def _run_monte_carlo(self, *, counted: bool = True) -> Steps:
+        """Spend the rest on base draws."""
+        goal, simulator, first, stopped = self.goal, self.simulator, self.simulator.n_sim, False
+        size, base = 10_000 if goal.target_cov is None else self._target_batch, simulator.inputs.base
+        draws, explored = KeptDraws(goal.gamma, self.inputs.dim), base.from_standard_normal(self.base_u)
+        if counted:
+            draws.add(explored, self.base_f)
+        while self.left_at_all > 0:
+            u = self.rng.standard_normal((min(self.left_at_all, size), simulator.inputs.dim))
+            x = base.from_standard_normal(u)
+            try:
+                f = yield from simulator.simulate(x)
+            except Interrupted:
+                stopped = True
+                break
+            draws.add(x, f)
+            hits, n = draws.counts
+            simulator.record(float((f <= goal.gamma).mean()), hits / n, len(f), binomial_cov(hits / n, n))
+            if self.meets_target(binomial_cov(hits / n, n)):
+                break
+        if draws.counts[1] == 0:
+            draws.add(explored, self.base_f)
+        n_new = simulator.n_sim - first
+        n_before = draws.counts[1] - n_new  # base draws of the exploration, its first simulations
+        outcome = draws.outcome(goal, simulator.close_trace())
+        parts = [(start, n) for start, n in ((0, n_before), (first, n_new)) if n]
+        # A share of draws, but only in runs that came to this: it must not be pooled with others.
+        outcome = replace(outcome, counts=None, draw_weights=outcome.draw_weights[0].split(*parts))
+        return replace(outcome, status=Status.STOPPED) if stopped else outcome
 
-    p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
-    """
-    goal, inputs, stopped = run.goal, run.simulator.inputs, False
-    typical = typical_weights(refinement, proposal, state.history)
-    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical)
-    whole = sample
-    size = run.left if goal.target_cov is None else _target_batch(run)
-    while run.left_at_all > 0:
-        try:
-            state, batch = yield from _draw(run, state, proposal, min(size, run.left_at_all))
-        except Interrupted:
-            stopped = True
-            break
-        sample = sample.add(batch, proposal, inputs, goal.gamma)
-        whole = reduce(StratifiedSample.join, (each for each, _ in state.counted), sample)
-        _record_draws(run, batch, whole.p, whole.cov, whole.draws.ess)
-        if run.meets_target(whole.cov):
-            break
-    if sample.draws.n == 0:
-        early = _estimate_early(run, state)
-        return early if stopped else replace(early, status=Status.BUDGET)
-    discovery = refinement.exploration.discovery
-    low, high = sampling_interval(whole.draws, whole.cov, goal.confidence, whole.largest_weight, discovery)
-    raised = add_unseen(whole.p, high, discovery.lineages, goal.confidence)
-    outcome = _outcome(run, state, whole.draws, whole.cov, (low, raised))
-    points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
-    parts = (*state.counted, (sample, run.simulator.n_sim - sample.draws.n))
-    hits = int((state.base_f <= goal.gamma).sum())
-    doubts = [
-        *check_base_draws(whole.p, hits, len(state.base_f)),
-        *check_rounds(sample, state.rounds),
-        *check_regions(whole),
-    ]
-    return replace(
-        outcome,
-        warnings=(*outcome.warnings, *doubts),
-        remarks=(*outcome.remarks, *describe_discovery(whole.p, high, raised, discovery, goal.confidence)),
-        sample=replace(points, lineages=discovery.lineages),
-        draw_weights=tuple(w for part, first in parts for w in part.draws.weights_after(first, whole.draws.n)),
-        status=Status.STOPPED if stopped else outcome.status,
-    )
+    def _draw(self, n: int) -> SimulationSteps[ComponentDraws]:
+        """Make n > 0 draws of the proposal; those from its first component, the base distribution, are counted."""
+        u, counts = self.proposal.draw(n, self.rng)
+        x, first = self.simulator.inputs.base.from_standard_normal(u), self.simulator.n_sim
+        f = yield from self.simulator.simulate(x)
+        self.base_draws += int(counts[0])
+        return ComponentDraws(self.proposal.components, counts, u, f, first, x)
 
+    @property
+    def _target_batch(self) -> int:
+        """Draws after which a target c.o.v. is looked at."""
+        return max(self.budget // TARGET_BATCHES, 100)
 
-def _estimate_early(run: SearchRun, state: RunState) -> Outcome:
-    """Return what all draws from known components say, for a run that ends before its estimate."""
-    u, f, log_weights = state.history.all_draws()
-    x = run.simulator.inputs.base.from_standard_normal(u)
-    draws = Draws.from_outcomes(f, log_weights + math.log(len(f)), x, run.goal.gamma)
-    largest_weight = draws.n / max(len(state.base_f), 1)
-    interval = weighted_interval(draws, run.goal.confidence, largest_weight, draws.cov)
-    outcome = _outcome(run, state, draws, draws.cov, interval)
-    parts = [(batch.first, len(batch.f)) for batch in state.history.batches]
-    weights = tuple(part for each in draws.weights_after(0) for part in each.split(*parts))
-    return replace(outcome, draw_weights=weights, status=Status.STOPPED)
+    def _record_draws(self, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:
+        """Add draws of a proposal to the trace."""
+        self.simulator.record(float((batch.f <= self.goal.gamma).mean()), estimate, len(batch.f), cov, ess)
 
-
-def _run_monte_carlo(run: SearchRun, state: RunState, *, counted: bool = True) -> Steps:
-    """Spend the rest on base draws."""
-    goal, simulator, first, stopped = run.goal, run.simulator, run.simulator.n_sim, False
-    size, base = 10_000 if goal.target_cov is None else _target_batch(run), simulator.inputs.base
-    draws, explored = KeptDraws(goal.gamma, run.inputs.dim), base.from_standard_normal(state.base_u)
-    if counted:
-        draws.add(explored, state.base_f)
-    while run.left_at_all > 0:
-        x = base.from_standard_normal(run.rng.standard_normal((min(run.left_at_all, size), simulator.inputs.dim)))
-        try:
-            f = yield from simulator.simulate(x)
-        except Interrupted:
-            stopped = True
-            break
-        draws.add(x, f)
-        hits, n = draws.counts
-        simulator.record(float((f <= goal.gamma).mean()), hits / n, len(f), binomial_cov(hits / n, n))
-        if run.meets_target(binomial_cov(hits / n, n)):
-            break
-    if draws.counts[1] == 0:
-        draws.add(explored, state.base_f)
-    n_new = simulator.n_sim - first
-    n_before = draws.counts[1] - n_new  # base draws of the exploration, its first simulations
-    outcome = draws.outcome(goal, simulator.close_trace())
-    parts = [(start, n) for start, n in ((0, n_before), (first, n_new)) if n]
-    # A share of draws, but only in runs that came to this: it must not be pooled with others.
-    outcome = replace(outcome, counts=None, draw_weights=outcome.draw_weights[0].split(*parts))
-    return replace(outcome, status=Status.STOPPED) if stopped else outcome
-
-
-def _draw(
-    run: SearchRun, state: RunState, proposal: MixtureProposal, n: int
-) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
-    """Make n > 0 draws of a proposal; those from its first component, the base distribution, are counted."""
-    u, counts = proposal.draw(n, run.rng)
-    x, first = run.simulator.inputs.base.from_standard_normal(u), run.simulator.n_sim
-    f = yield from run.simulator.simulate(x)
-    batch = ComponentDraws(proposal.components, counts, u, f, first, x)
-    return replace(state, base_draws=state.base_draws + int(counts[0])), batch
-
-
-def _target_batch(run: SearchRun) -> int:
-    """Return the draws after which a target c.o.v. is looked at."""
-    return max(run.budget // TARGET_BATCHES, 100)
-
-
-def _record_draws(run: SearchRun, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:
-    """Add draws of a proposal to the trace."""
-    run.simulator.record(float((batch.f <= run.goal.gamma).mean()), estimate, len(batch.f), cov, ess)
-
-
-def _outcome(run: SearchRun, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
-    """Return what weighted draws say of p."""
-    outcome = draws.outcome(run.goal, Status.CONVERGED, run.simulator.close_trace(), 1.0, state.base_draws)
-    wide = Sizes.within(run.budget).wide if len(state.base_f) else ()
-    return replace(outcome, cov=cov, interval=interval, wide_draws=wide)
+    def _outcome(self, draws: Draws, cov: float, interval: Interval) -> Outcome:
+        """Return what weighted draws say of p."""
+        outcome = draws.outcome(self.goal, Status.CONVERGED, self.simulator.close_trace(), 1.0, self.base_draws)
+        wide = Sizes.within(self.budget).wide if len(self.base_f) else ()
+        return replace(outcome, cov=cov, interval=interval, wide_draws=wide)
