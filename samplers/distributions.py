@@ -20,9 +20,8 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaincc, betainccinv, betaincinv, betaln, digamma, ndtr, ndtri
 
 from samplers.bases import Gaussian, IndependentDistributions
-from samplers.components import expectation_maximisation, one_hot, posterior
 from samplers.problem import Distribution, FloatArray, Inputs, StandardNormal, needs_library
-from samplers.proposals import Mixture, move_gaussian
+from samplers.proposals import Mixture, expectation_maximisation, move_gaussian, one_hot, posterior
 
 __all__ = ["BetaBlock", "Distribution", "GaussianBlock", "MixtureBlock", "NormalBlock", "Product", "StandardNormal"]
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.bases import DrawnByItsMap
-from samplers.components import MixtureComponent
 from samplers.method import Goal
 from samplers.problem import FloatArray, Inputs
+from samplers.proposals import MixtureComponent
 from samplers.sample import Level
 
 

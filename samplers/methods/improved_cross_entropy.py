@@ -8,11 +8,16 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import log_ndtr
 
-from samplers.components import VonMisesFisherNakagami
 from samplers.importance import Search
 from samplers.method import Goal, Method, Steps
 from samplers.problem import FloatArray, Inputs, check_settings
-from samplers.proposals import Mixture, ProposalDistribution, fit_proposal_mixture, fit_shrunk_gaussian
+from samplers.proposals import (
+    Mixture,
+    ProposalDistribution,
+    VonMisesFisherNakagami,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+)
 from samplers.sample import Status, normalise_weights
 
 HUGE = 1e300

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.components import VonMisesFisherNakagami
 from samplers.importance import Draws, bernstein_bound, calibrate, weight_warnings, weighted_interval
-from samplers.proposals import Gaussian, Mixture, correct_eigenvalues, fit_proposal_mixture, fit_shrunk_gaussian
+from samplers.proposals import (
+    Gaussian,
+    Mixture,
+    VonMisesFisherNakagami,
+    correct_eigenvalues,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+)
 
 BETA = 1.7
 P = stats.norm.sf(BETA)
@@ -135,22 +141,13 @@ TWO = Mixture(
 )
 
 
-def test_mixture_is_recovered(rng):
-    found = fit_proposal_mixture(fit_shrunk_gaussian, TWO.sample(8000, rng), even(8000), 4, 5, rng)
-    order = np.argsort(found.weights)
-    assert len(order) == 2  # the criterion finds the number
-    np.testing.assert_allclose(found.weights[order], TWO.weights, atol=0.03)
-    for k, component in zip(order, TWO.components, strict=True):
-        np.testing.assert_allclose(found.components[k].mean, component.mean, atol=0.1)
-        np.testing.assert_allclose(found.components[k].covariance, component.covariance, atol=0.1)
-
-
 def test_weighted_points_stand_for_their_distribution(rng):
     """Draws of a wide distribution under weights p / q."""
     wide = Gaussian(np.zeros(2), 3 * np.eye(2))
     u = wide.sample(40_000, rng)
     weights = np.exp(TWO.log_prob(u) - wide.log_prob(u))
     found = fit_proposal_mixture(fit_shrunk_gaussian, u, weights / weights.sum(), 4, 5, rng)
+    assert len(found.weights) == 2  # the criterion finds the number
     test = TWO.sample(4000, rng)
     assert np.mean(TWO.log_prob(test) - found.log_prob(test)) < 0.02  # Kullback-Leibler divergence
 

@@ -23,11 +23,6 @@ def test_clopper_pearson_against_scipy():
         np.testing.assert_allclose(clopper_pearson(hits, 50, 0.9), exact)
 
 
-def test_correlation_factor_of_frozen_chains_is_length_minus_one():
-    inside = np.repeat(np.arange(40)[:, None] < 10, 8, axis=1)
-    assert correlation_factor(inside, np.full(40, 8)) == pytest.approx(7.0)
-
-
 def markov_chains(rng, chains, steps, p, stay):
     """Indicator chains that keep their value with probability `stay`, else draw it anew."""
     inside = rng.random((chains, steps)) < p

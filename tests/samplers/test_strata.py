@@ -2,7 +2,6 @@
 
 import json
 import math
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -149,15 +148,6 @@ def test_a_base_with_strata_serves_a_function():
 # ---- how a run goes
 
 
-def test_the_same_seed_is_the_same_answer_with_any_workers():
-    problem = roads()
-    here = samplers.estimate(problem, seed=5, max_sim=3000)
-    with ThreadPoolExecutor(3) as pool:
-        there = samplers.estimate(problem, seed=5, max_sim=3000, executor=pool)
-    assert here == there and here.parts == there.parts
-    assert here != samplers.estimate(problem, seed=6, max_sim=3000)
-
-
 @pytest.mark.parametrize("method", ["mc", "two-stage", "adss", "ce"])
 def test_an_interruption_anywhere_leaves_a_valid_estimate(method):
     problem = roads()
@@ -167,14 +157,6 @@ def test_an_interruption_anywhere_leaves_a_valid_estimate(method):
         assert result.n_sim == sum(level.n_sim for level in result.trace)
         if result.n_sim < whole.n_sim:
             assert result.status is Status.STOPPED and result.interval[0] <= P <= result.interval[1]
-
-
-def test_a_journal_continues_to_the_same_bits(tmp_path):
-    problem, arguments = roads(), {"seed": 4, "max_sim": 3000, "journal": tmp_path / "journal"}
-    cut = samplers.estimate(problem, **arguments, stop=lambda at: at.n_sim > 1500)
-    assert cut.status is Status.STOPPED
-    again = samplers.estimate(problem, **arguments)
-    assert again == samplers.estimate(problem, seed=4, max_sim=3000)
 
 
 def test_a_stratum_without_a_failure_raises_the_upper_end_alone():
@@ -228,12 +210,6 @@ def test_a_stratum_that_may_add_most_is_looked_at_before_the_target_counts_as_me
     for seed in range(5):
         result = samplers.estimate(even((0.99, 0.01), (3.09, 1.0)), "mc", seed=seed, max_sim=20_000, target_cov=0.2)
         assert result.parts[0].p > 0 and result.parts[0].n_sim > 2000
-
-
-def test_a_target_that_cannot_be_met_is_told():
-    result = samplers.estimate(even(), "mc", seed=0, max_sim=300, target_cov=0.001)
-    assert result.status is Status.BUDGET and any("was not met" in text for text in result.remarks)
-    assert result.n_sim == 300
 
 
 @pytest.mark.parametrize("max_sim", [1, 2, 4, 61, 100])

@@ -14,22 +14,24 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from samplers.bases import Gaussian
-from samplers.components import (
-    IsotropicNormal,
-    LiftedComponent,
-    MixtureComponent,
-    SubspaceGaussian,
-    draw_components,
-    draw_counts,
-    log_ratios,
-    mixture_log_ratio,
-    posterior,
-)
 from samplers.methods.base import SimulationSteps
 from samplers.methods.series import LAW, ROUNDS, WALKS
 from samplers.methods.series.walks import TermSimulator, Walks, join_terms
 from samplers.problem import FloatArray, Terms
-from samplers.proposals import correct_eigenvalues, fit_proposal_mixture, fit_shrunk_gaussian
+from samplers.proposals import (
+    IsotropicNormal,
+    LiftedComponent,
+    MixtureComponent,
+    SubspaceGaussian,
+    correct_eigenvalues,
+    draw_components,
+    draw_counts,
+    fit_proposal_mixture,
+    fit_shrunk_gaussian,
+    log_ratios,
+    mixture_log_ratio,
+    posterior,
+)
 from samplers.sample import effective_sample_size, normalise_weights
 
 

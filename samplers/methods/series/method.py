@@ -9,7 +9,6 @@ from typing import Any, ClassVar, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.components import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, weighted_interval
 from samplers.method import Goal, Interrupted, Method, Outcome, Steps, offer_of, request_terms
 from samplers.methods.base import SearchRun, SimulationSteps
@@ -19,6 +18,7 @@ from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms,
 from samplers.methods.series.walks import TermSimulator, plan_walks, walk_downhill
 from samplers.methods.subset import spend_on_subset_simulation
 from samplers.problem import FloatArray, Inputs, check_settings
+from samplers.proposals import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
 from samplers.sample import DrawWeights, Status, binomial_cov, clopper_pearson
 
 

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.components import HalfSpaceIntersection
 from samplers.methods.two_stage.settings import PLANES
 from samplers.problem import FloatArray
+from samplers.proposals import HalfSpaceIntersection
 
 MIN_POINTS = 5
 """Points that a regression needs beside one for each coefficient."""

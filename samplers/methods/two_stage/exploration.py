@@ -35,7 +35,6 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.components import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
 from samplers.mcmc import Chains, Kernel, NextLevel, RootedPoints, descend, independent_chains, judge_levels
 from samplers.method import Goal, Interrupted
 from samplers.methods.base import ComponentDraws, SimulationSteps, Simulator
@@ -50,6 +49,7 @@ from samplers.methods.two_stage.regions import (
 )
 from samplers.methods.two_stage.settings import BUDGET, EXPLORATION, HIGH_DIM, LINES, SLOPES
 from samplers.problem import FloatArray
+from samplers.proposals import IsotropicNormal, MixtureComponent, draw_components, log_ratios, mixture_log_ratio
 from samplers.sample import Status, next_level
 
 LEAST_SLOPES = 4

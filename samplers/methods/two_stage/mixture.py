@@ -19,7 +19,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.components import (
+from samplers.methods.two_stage.edges import weighted_quantile
+from samplers.methods.two_stage.settings import FIT, HIGH_DIM
+from samplers.problem import FloatArray
+from samplers.proposals import (
     MixtureComponent,
     RadialLaw,
     SubspaceGaussian,
@@ -32,9 +35,6 @@ from samplers.components import (
     shrink_covariance,
     start_from_centres,
 )
-from samplers.methods.two_stage.edges import weighted_quantile
-from samplers.methods.two_stage.settings import FIT, HIGH_DIM
-from samplers.problem import FloatArray
 from samplers.sample import normalise_weights
 
 Kind = Literal["base", "radial", "gaussian", "linear", "explored", "tempered", "spread", "directional"]

@@ -13,13 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from samplers.components import (
-    IsotropicNormal,
-    LiftedComponent,
-    SubspaceGaussian,
-    VonMisesFisherNakagami,
-    log_ratios,
-)
 from samplers.methods.base import ComponentDraws
 from samplers.methods.two_stage.edges import half_spaces, weighted_quantile
 from samplers.methods.two_stage.mixture import (
@@ -39,6 +32,13 @@ from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import HIGH_DIM, PROPOSAL
 from samplers.methods.two_stage.stratified import MultipleImportanceSample
 from samplers.problem import FloatArray
+from samplers.proposals import (
+    IsotropicNormal,
+    LiftedComponent,
+    SubspaceGaussian,
+    VonMisesFisherNakagami,
+    log_ratios,
+)
 from samplers.sample import effective_sample_size
 
 

@@ -24,13 +24,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import bdtrc
 
-from samplers.components import MixtureComponent, log_ratios, mixture_log_ratio
 from samplers.importance import Draws, calibrate
 from samplers.methods.base import ComponentDraws
 from samplers.methods.two_stage.mixture import MixtureProposal
 from samplers.methods.two_stage.regions import Discovery
 from samplers.methods.two_stage.settings import DOUBT
 from samplers.problem import FloatArray, Inputs
+from samplers.proposals import MixtureComponent, log_ratios, mixture_log_ratio
 from samplers.sample import Sample, effective_sample_size
 
 

@@ -55,13 +55,6 @@ def test_parts_of_p_add_up():
     assert (nothing.ess == 0).all()
 
 
-def test_a_path_of_a_chain_counts_once():
-    result = run(fitted([normal()]), "adss", max_sim=None)
-    failing = result.sample.f <= 0.0
-    ess = reweight_to_refits(result, [normal()]).ess[0, 0]
-    assert ess <= len(np.unique(result.sample.units[failing])) < failing.sum()
-
-
 def test_the_decision_needs_points_and_an_ensemble():
     far = [normal(7.0, 0.3)] * 30
     result = run(fitted(far, FittedWithEnsemble), ensemble_run=False)

@@ -63,18 +63,6 @@ def test_derivatives_are_those_of_the_half_space(method):
         assert 0 < each.error < 0.5
 
 
-def test_standard_errors_are_those_of_repetitions():
-    """The spread of 30 runs over the stated error: 1 within the error of 30 draws."""
-    found = [
-        {each.name: each for each in run(method="is", seed=seed, max_sim=1500).sensitivity().parameters}
-        for seed in range(30)
-    ]
-    for j, name in enumerate(("mean of x1", "mean of x3")):
-        z = np.array([(each[name].d_log_p - (ALPHA * HAZARD)[2 * j]) / each[name].error for each in found])
-        assert abs(z.mean()) < 4 / np.sqrt(30)
-        assert 0.6 < z.std() < 1.5
-
-
 def test_shares_of_the_spread_add_up_and_name_what_varies():
     """Var of g_i delta_i: (0.8 h 0.3)^2 by the mean and (0.1 x 0.36 beta h)^2 by the sd."""
     found = run(fitted(200), max_sim=6000).sensitivity(["speed", "gap", "offset"])
@@ -102,14 +90,6 @@ def test_without_comparable_refits_there_are_no_shares(result):
     same = fitted(12)
     same.refits = (ParametricNormal(BASE.mean, BASE.sd),) * 12
     assert "does not differ" in run(same).sensitivity().reason
-
-
-def test_a_base_without_parameters_has_importance_only():
-    problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-    found = samplers.estimate(problem, seed=0, max_sim=3000).sensitivity()
-    assert found.parameters == ()
-    assert found.columns[0].name == "x1"
-    assert str(found).splitlines()[-1] == "the base distribution (StandardNormal) offers no parameters."
 
 
 def test_json_and_picture(tmp_path):

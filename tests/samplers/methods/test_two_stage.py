@@ -80,20 +80,6 @@ def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
     assert any("too few for an exploration" in text for text in result.remarks)
 
 
-@pytest.mark.parametrize(
-    "f",
-    [
-        lambda u: np.where(u[:, 0] > 3, -np.inf, np.where(u[:, 0] < 1, np.inf, 3 - u[:, 0])),
-        lambda u: np.where(u[:, 0] > 3, -1.0, 1.0),
-        lambda u: np.floor(2 * (3 - u[:, 0])) + 0.5,
-    ],
-    ids=["infinite", "an indicator", "steps"],
-)
-def test_any_kind_of_outcome(f):
-    result = samplers.estimate(FunctionProblem(f, 3), TS(), seed=1, max_sim=2500)
-    assert abs(result.p / PHI(-3.0) - 1) < 4 * result.cov
-
-
 def test_estimate_rests_on_the_draws_of_the_last_round_and_those_after_it_alone():
     """Its points are the last ones asked for; nothing of the exploration counts twice."""
     reference, asked = half_space(100, 3.5), []
@@ -106,19 +92,6 @@ def test_estimate_rests_on_the_draws_of_the_last_round_and_those_after_it_alone(
     failing = last[reference.problem.f(last) <= 0]
     np.testing.assert_array_equal(result.sample.x, failing)
     assert [level.n_sim for level in result.trace[-2:]] == [len(x) for x in asked[-2:]]
-
-
-@pytest.mark.parametrize("after", [500, 1500, 2000])
-@pytest.mark.parametrize("reference", [half_space(100, 3.0), two_regions(5, 2.8, 3.0)], ids=lambda r: r.name)
-def test_stopped_in_any_phase(recorder, reference, after):
-    """What draws from known distributions say so far: an interval that holds p, give or take."""
-    stop = lambda seen: seen.n_sim >= after  # noqa: E731
-    result = counted(recorder, reference.problem, TS(n=4000), seed=3, stop=stop)
-    assert result.status == "stopped"
-    assert result.interval[0] / 1.3 <= reference.p <= 1.3 * result.interval[1]
-    if result.p > 0:
-        assert result.cov < 2
-        assert result.sample.weights[result.sample.f <= 0].sum() == pytest.approx(result.p)
 
 
 def case(name):
