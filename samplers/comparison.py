@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from scipy.special import stdtrit
@@ -174,13 +174,10 @@ class Comparison(Kept):
     def _ratio_text(self) -> str:
         """The ratio, or its bound where one of the two did not fail."""
         low, high = self.interval
-        if self._has_ratio:
-            return f"p_A / p_B = {format_alike(self.ratio)[0]}"
         if math.isnan(self.ratio):
             return "p_A / p_B not known"
-        return (
-            f"p_A / p_B {'below' if self.ratio == 0 else 'above'} {format_alike(high if self.ratio == 0 else low)[0]}"
-        )
+        about, value = ("=", self.ratio) if self._has_ratio else ("below", high) if self.ratio == 0 else ("above", low)
+        return f"p_A / p_B {about} {format_alike(value)[0]}"
 
     def __repr__(self) -> str:
         ends = " [{}, {}]".format(*format_alike(*self.interval)) if self._has_ratio else ""
@@ -204,15 +201,9 @@ class Comparison(Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; NaN and infinities become None."""
-        names = ("ratio", "interval", "confidence", "both", "shares", "n_sim", "warnings")
-        data = {
-            **{name: getattr(self, name) for name in names},
-            "either": self.either.to_dict(),
-            "base_uncertainty": None if self.base_uncertainty is None else self.base_uncertainty.to_dict(),
-            "a": asdict(self.a),
-            "b": asdict(self.b),
-        }
-        return {key: to_json_value(value) for key, value in data.items()}
+        names = ("ratio", "interval", "confidence", "both", "shares", "n_sim", "warnings", "base_uncertainty", "a", "b")
+        data = {name: getattr(self, name) for name in names} | {"either": self.either.to_dict()}
+        return cast(dict[str, Any], to_json_value(data))
 
 
 def list_ratio_facts(
@@ -387,7 +378,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     single = has_independent_points(sample)
     a, b = (_side(total, totals, factor, single, either) for total in totals)
     few = [
-        f"{name} failed in no draw" if s.ess == 0 else f"{name} failed in only {s.ess:.0f} effective draws"
+        f"{name} failed in {f'only {s.ess:.0f} effective draws' if s.ess else 'no draw'}"
         for name, s in (("A", a), ("B", b))
         if s.ess < 30  # its c.o.v. is about 0.2 or more
     ]
@@ -398,8 +389,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
             about.append(
                 f"{name} may fail more often by up to {most:.1e} in {' and '.join(where)}: too few failures found."
             )
-    interval = _ratio_interval(totals, factor, single, either)
-    n_sim = problem.n_sim - (0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim)
+    interval, further = _ratio_interval(totals, factor, single, either), either.ensemble_run
     return Comparison(
         ratio=_ratio(a.p, b.p),
         interval=interval,
@@ -407,7 +397,7 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
         a=a,
         b=b,
         both=float(weights[which.astype(bool).all(axis=0)].sum()),
-        n_sim=n_sim,
+        n_sim=problem.n_sim - (0 if further is None else 2 * further.n_sim),
         warnings=(*either.warnings, *about),
         either=either,
         base_uncertainty=_base_uncertainty(totals, factor, either, problem, interval),

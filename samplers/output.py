@@ -48,7 +48,7 @@ _CLASSES: dict[str, type] = {}
 def to_json_value(value: Any) -> Any:
     """Return value with None for NaN and infinities, dicts for dataclasses, and numbers and lists of Python."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = dataclasses.asdict(value)
+        value = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, float):

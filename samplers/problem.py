@@ -3,8 +3,6 @@
 Small f is dangerous. Errors say what was expected and given.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import sys

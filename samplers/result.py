@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -400,23 +400,15 @@ class Estimate(EstimateData, Kept):
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
         plain = "p interval sequence confidence cov gamma n_sim base_draws unseen unseen_corner given gain remarks seed"
-        uncertainty, points = self.base_uncertainty, self.failures
+        plain += " base_uncertainty warnings choice closest trace failures"
         data = {name: getattr(self, name) for name in plain.split()} | {
-            "base_uncertainty": None if uncertainty is None else uncertainty.to_dict(),
             "text": str(self),
-            "warnings": self.warnings,
-            "choice": self.choice,
             "final_draws": None if self.sample is None else self.sample.n_units,
             "parts": [part.to_dict() for part in self.parts],
             "status": str(self.status),
-            "closest": None if self.closest is None else {"x": self.closest.x.tolist(), "f": self.closest.f},
-            "trace": [asdict(level) for level in self.trace],
-            "failures": {"total": points.total}
-            | {name: getattr(points, name).tolist() for name in ("x", "f", "log_p0")},
             "method": {"name": self.method.name, "settings": method_settings(self.method)},
         }
-        found: dict[str, Any] = to_json_value(data)
-        return found
+        return cast(dict[str, Any], to_json_value(data))
 
     def to_json(self) -> str:
         """Return `to_dict` as one line of JSON."""

@@ -1,7 +1,5 @@
 """Run: replicates of a method side by side, with simulations made outside (ask for points, tell their outcomes)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Workers: how a chunk of a request is computed in another process, and what is said of one that is lost."""
 
-from __future__ import annotations
-
 import faulthandler
 import os
 import pickle

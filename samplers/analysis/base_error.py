@@ -24,8 +24,6 @@ within their intervals at all thresholds together (sup-t, as in `samplers.analys
 is on the safe side: its large values come together.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -22,7 +22,7 @@ from samplers.analysis.weighted import (
     unit_sums,
 )
 from samplers.method import EstimateData
-from samplers.output import drawing_axes
+from samplers.output import drawing_axes, to_json_value
 from samplers.problem import FloatArray
 from samplers.sample import Interval, Sample
 
@@ -209,7 +209,7 @@ class Exceedance(Curve):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
-        return {**super().to_dict(), "base": None if self.base is None else self.base.to_dict()}
+        return {**super().to_dict(), "base": to_json_value(self.base)}
 
     def plot(self, ax: Axes | str | PathLike[str] | None = None) -> Axes:
         """Draw the curve, its band and that of the base distribution, p on a log scale; needs matplotlib.

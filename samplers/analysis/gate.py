@@ -26,8 +26,6 @@ runs (subset simulation) is repeated: N(c) = N0 (c0 / c)^2, but at least 5 runs.
 The pilot knows its own c.o.v. to a few ten per cent, and another seed finds another proposal.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ reaches from the lowest end to the highest; what is expected for the next event 
 by its share of the refits.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ References:
     application to SVARs", Journal of Applied Econometrics 34, 2019 (the sup-t band).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
