@@ -212,8 +212,10 @@ class RayCluster(_Processes):
         if started:
             self._start(ray)
         try:
-            tasks = _RayTasks(ray, {"num_cpus": 1, "max_retries": 0, **self.options})
-            workers = self.workers or tasks.count_places()
+            options, total = {"num_cpus": 1, "max_retries": 0, **self.options}, ray.cluster_resources()
+            tasks, needs = _RayTasks(ray, options), {"CPU": options["num_cpus"], "GPU": options.get("num_gpus", 0)}
+            room = min(int(total.get(name, 0.0) / need) for name, need in needs.items() if need)
+            workers = self.workers or max(1, room)
             with closing(WorkerPool(work, self, lambda: tasks, workers, ours=False, blames=True)) as pool:
                 yield pool
         finally:
@@ -490,7 +492,7 @@ class _RayTasks:
     """Ray as an object with `submit`."""
 
     def __init__(self, ray: Any, options: Mapping[str, Any]) -> None:
-        self._ray, self._options, self._task = ray, options, ray.remote(**options)(compute_in_worker)
+        self._ray, self._task = ray, ray.remote(**options)(compute_in_worker)
         self._sent: tuple[str, Any] = ("", None)
 
     def submit(self, function: Any, key: str, packed: bytes, *arguments: Any) -> Any:
@@ -501,12 +503,6 @@ class _RayTasks:
         job = reference.future()
         job.cancel = lambda: self._ray.cancel(reference, force=True) or True
         return job
-
-    def count_places(self) -> int:
-        """Return for how many tasks the cluster has cores and GPUs."""
-        total = self._ray.cluster_resources()
-        needs = {"CPU": self._options["num_cpus"], "GPU": self._options.get("num_gpus", 0)}
-        return max(1, min(int(total.get(name, 0.0) / need) for name, need in needs.items() if need))
 
 
 def _has_submit(executor: Any) -> bool:

@@ -375,12 +375,6 @@ class StandardNormal:
         return u
 
 
-NO_FUNCTION = (
-    "This FunctionProblem has no f to simulate with: give it one, FunctionProblem(f, ...), or simulate elsewhere: "
-    "run = samplers.Auto().start(problem), x = run.ask(), run.tell(f)."
-)
-
-
 @dataclass(frozen=True, repr=False)
 class FunctionProblem:
     """Any vectorised function, under N(0, I) or another base distribution; or its inputs alone, for ask and tell.
@@ -474,7 +468,10 @@ class FunctionProblem:
         """
         _check_points(x, self.dim)
         if self.f is None and self.terms is None:
-            raise EvaluationError(NO_FUNCTION)
+            raise EvaluationError(
+                "This FunctionProblem has no f to simulate with: give it one, FunctionProblem(f, ...), or simulate "
+                "elsewhere: run = samplers.Auto().start(problem), x = run.ask(), run.tell(f)."
+            )
         if self.f is None:
             return np.asarray(self.terms(x).f)
         if not self.vectorized:

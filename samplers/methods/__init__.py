@@ -122,16 +122,13 @@ class Auto(Method):
             how = ", failures foreseen" if run.learned else ""
             return replace(found, chosen=Choice(Surrogate(), f"surrogate: {size}{how}", unusual=True))
         left = budget - len(run.f)
-        rest, method = replace(goal, max_sim=left), AdaptiveSubsetSimulation() if run.many else TwoStage()
-        if isinstance(method, AdaptiveSubsetSimulation):
-            assert len(run.f) == run.n_base  # base draws, all of them
-            known = RootedPoints(run.u, run.f, np.arange(run.n_base)) if run.inputs is inputs else None
-            steps = method.steps(inputs, rest, rng, known)
-        else:
-            steps = method.steps(inputs, rest, rng)
-        why = f"kriging explains {max(100 * run.skill, 0):.0f} % of f" if run.many else "failures were not foreseen"
+        rest, why, method = replace(goal, max_sim=left), "failures were not foreseen", cast(Any, TwoStage())
+        about = [inputs, rest, rng]
+        if run.many:  # all simulations so far are base draws
+            about.append(RootedPoints(run.u, run.f, np.arange(run.n_base)) if run.inputs is inputs else None)
+            method, why = AdaptiveSubsetSimulation(), f"kriging explains {max(100 * run.skill, 0):.0f} % of f"
         choice = Choice(method, f"{method.name}: {size}, {why}; {left:,} simulations were left", unusual=True)
-        return replace((yield from run.go_on(steps)), chosen=choice)
+        return replace((yield from run.go_on(method.steps(*about))), chosen=choice)
 
 
 ENTRY_POINT_GROUP = "rare_envs.samplers"

@@ -169,7 +169,14 @@ class SurrogateRun:
             about = f"max_sim leaves {self.budget} simulations, too few to learn from ({LEAST_BUDGET}): "
             return (yield from self.draw_base()).remark_first(about + "base draws only.")
         try:
-            yield from self._simulate(self._design())
+            if self.many:  # subset simulation may go on with them
+                design = self.rng.standard_normal((self.n_base, self.inputs.dim))
+            else:
+                from scipy.stats import qmc  # takes a second to import
+
+                cubes = [qmc.LatinHypercube(self.inputs.dim, rng=self.rng).random(self.n_base) for _ in self.scales]
+                design = np.concatenate([s * ndtri(cube) for s, cube in zip(self.scales, cubes, strict=True)])
+            yield from self._simulate(design)
             if (self.f[: self.n_base] <= self.goal.gamma).mean() >= 0.1:  # plain Monte Carlo is as good
                 return (yield from self.draw_base())
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, None)
@@ -187,15 +194,6 @@ class SurrogateRun:
             about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."
             return (yield from self.draw_base()).remark_first(about)
         return (yield from self._estimate(kriging, mixture))
-
-    def _design(self) -> FloatArray:
-        """Return the first points to simulate: Latin hypercubes of each scale, base draws alone in many dimensions."""
-        from scipy.stats import qmc  # takes a second to import
-
-        if self.many:  # subset simulation may go on with them
-            return self.rng.standard_normal((self.n_base, self.inputs.dim))
-        cubes = (qmc.LatinHypercube(self.inputs.dim, rng=self.rng).random(self.n_base) for _ in self.scales)
-        return np.concatenate([s * ndtri(cube) for s, cube in zip(self.scales, cubes, strict=True)])
 
     def draw_base(self) -> Steps:
         """Spend the rest on base draws; those of the design do not count, for they may have decided it."""

@@ -362,7 +362,12 @@ def find_slopes(
             return None
         axes, others = _leading_directions(slopes), np.setdiff1d(np.arange(len(points.u)), chosen)
         points = _Points(points.u[others], points.fails[others], points.turns[others])
-        chosen = _choose_unexplained(points, size, axes)
+        # half of them fail though they are short along these directions, the others are long and do not fail
+        length = np.linalg.norm(points.u @ axes, axis=1)
+        shortest = np.argsort(np.where(points.fails, length, np.inf), kind="stable")[: points.fails.sum()]
+        longest = np.argsort(np.where(points.fails, np.inf, -length), kind="stable")[: (~points.fails).sum()]
+        half = longest[: size // 2]
+        chosen = np.concatenate([shortest[: size - len(half)], half])
         more = yield from _differentiate(simulator, points.u[chosen], 0.05)
         slopes = np.concatenate([slopes, more])
         if ((more @ axes) ** 2).sum() >= 0.99 * len(more):  # nothing new
@@ -400,18 +405,6 @@ def _collect_points(exploration: ExplorationResult, gamma: float, rng: np.random
         np.repeat(fails, sizes),
         np.concatenate([np.arange(size) for size in sizes]),
     )
-
-
-def _choose_unexplained(points: _Points, n: int, axes: FloatArray) -> NDArray[np.int64]:
-    """Return the indices (k,) of at most n points whose outcomes known directions (d, r) explain least.
-
-    Half of them fail though they are short along these directions, the others are long and do not fail.
-    """
-    length = np.linalg.norm(points.u @ axes, axis=1)
-    shortest = np.argsort(np.where(points.fails, length, np.inf), kind="stable")[: points.fails.sum()]
-    longest = np.argsort(np.where(points.fails, np.inf, -length), kind="stable")[: (~points.fails).sum()]
-    half = longest[: n // 2]
-    return np.concatenate([shortest[: n - len(half)], half])
 
 
 def _differentiate(simulator: Simulator, u: FloatArray, step: float) -> SimulationSteps[FloatArray]:

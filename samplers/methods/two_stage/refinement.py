@@ -300,18 +300,6 @@ def _weighted_failures(state: RefinementState, history: MultipleImportanceSample
     return state.points, np.full(len(state.points), 1 / len(state.points))
 
 
-def _share_among_regions(state: RefinementState, history: MultipleImportanceSample) -> FloatArray:
-    """Return shares of the regions, shape (m,): as the roots of their weighted failures, by the densest Gaussian there.
-
-    The roots lie between equal shares, which many small regions would spend, and the failures' own.
-    """
-    regions = np.array([explored.region for explored in state.explored])
-    u, weights = _weighted_failures(state, history)
-    nearest = regions[log_ratios(state.gaussians, u).argmax(axis=0)]
-    roots = np.sqrt(np.bincount(nearest, weights=weights, minlength=len(state.regions)))
-    return np.asarray(roots / roots.sum())
-
-
 def _set_floors(
     state: RefinementState,
     history: MultipleImportanceSample,
@@ -330,7 +318,13 @@ def _set_floors(
     tempered = PROPOSAL.tempered_share[noisy]
     floors = [Floor(kinds == "tempered", tempered)]
     if n > 1 and not state.exploration.scattered:
-        shares = _share_among_regions(state, history)
+        # by the roots of the weighted failures nearest to each region: between equal shares, which many small regions
+        # would spend, and the failures' own
+        u, weights = _weighted_failures(state, history)
+        owners = np.array([explored.region for explored in state.explored])
+        nearest = owners[log_ratios(state.gaussians, u).argmax(axis=0)]
+        roots = np.sqrt(np.bincount(nearest, weights=weights, minlength=n))
+        shares = roots / roots.sum()
         floors = [Floor((kinds == "tempered") & (regions == k), tempered * shares[k]) for k in range(n)]
     if state.exploration.scattered or (state.rounds and state.rounds[-1].worth(state.gamma) < PROPOSAL.good_rate):
         floors.append(Floor(kinds == "spread", PROPOSAL.spread_share))
