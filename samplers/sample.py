@@ -145,11 +145,6 @@ class DrawWeights:
     run: int = 0
     log_share: float = 0.0
 
-    @classmethod
-    def of_equal_draws(cls, total: int, first: int, n: int) -> DrawWeights:
-        """Return the weights of n of `total` plain draws."""
-        return cls(first=first, log_weights=np.broadcast_to(-math.log(total), n))
-
     def split(self, *parts: tuple[int, int]) -> tuple[DrawWeights, ...]:
         """Return the weights in parts, each with what its run had spent before it, and its number of draws."""
         ends = np.cumsum([n for _, n in parts])

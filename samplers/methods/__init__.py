@@ -157,16 +157,17 @@ class Methods(Mapping[str, type[Stepping]]):
         """Our own and those of other packages by name."""
         loaded = dict(self._own)
         for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
+            name = entry.name
             try:
-                if entry.name in loaded:
+                if name in loaded:
                     raise ValueError("that name is taken")
                 found = _check_class(entry.load())
-                if found.name != entry.name:
-                    raise ValueError(f"the class {found.__name__} is named {found.name!r}, not as its entry point")
-                loaded[entry.name] = found
+                if found.name != name:
+                    raise ValueError(f"the class {found.__name__} is named {found.name!r}, its entry point {name!r}")
+                loaded[name] = found
             except Exception as error:  # an error of another package must not break this one
                 package = "" if entry.dist is None else f" of {entry.dist.name}"
-                what = f"The method {entry.name!r}{package} ({entry.value}) cannot be used"
+                what = f"The method {name!r}{package} ({entry.value}) cannot be used"
                 warnings.warn(f"{what}: {type(error).__name__}: {error}", RuntimeWarning, stacklevel=2)
         return loaded
 

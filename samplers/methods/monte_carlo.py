@@ -1,5 +1,6 @@
 """Plain Monte Carlo, and independent draws that are kept."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -48,12 +49,13 @@ class KeptDraws:
         else:
             safe = f[f > self._gamma]
             k = len(failing) + len(safe)
-            weights = [np.full(m, of / (n * m)) for of, m in ((hits, len(failing)), (n - hits, len(safe))) if m]
+            shares = [np.full(m, of / (n * m)) for of, m in ((hits, len(failing)), (n - hits, len(safe))) if m]
             f, units = np.concatenate([failing, safe]), np.arange(k, dtype=np.int64)
-            sample = Sample(f=f, weights=np.concatenate(weights), units=units, n_units=k, x=x)
+            sample = Sample(f=f, weights=np.concatenate(shares), units=units, n_units=k, x=x)
         missing = self._n_missing / hits if hits else 0.0
         outcome = Outcome.of_counts(hits, n, goal.confidence, trace, missing)
-        return replace(outcome, sample=sample, draw_weights=(DrawWeights.of_equal_draws(n, 0, n),))
+        weights = DrawWeights(first=0, log_weights=np.broadcast_to(-math.log(n), n))
+        return replace(outcome, sample=sample, draw_weights=(weights,))
 
 
 @dataclass(frozen=True, kw_only=True)

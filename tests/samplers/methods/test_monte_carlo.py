@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import samplers
-from samplers import method as kept_draws
 from samplers.method import Goal
+from samplers.methods import monte_carlo as kept_draws
 from samplers.methods.monte_carlo import KeptDraws
 
 
