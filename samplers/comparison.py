@@ -356,7 +356,7 @@ def compare(
         )
     x = a.base.sample(16, np.random.default_rng(0))
     if not np.allclose(a.base.log_prob(x), b.base.log_prob(x), rtol=1e-9, atol=1e-9):
-        raise ValueError("Expected two problems with one base distribution, got two densities: estimate each alone.")
+        raise ValueError("Expected two problems with the same base distribution: estimate each alone.")
     problem = EitherFails(a, b, gamma)
     limit = None if max_sim is None else max_sim // 2
     either = estimate(
