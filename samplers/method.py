@@ -1,26 +1,20 @@
-"""Contract of a method (`Stepping`, `Method`), its goal and outcome, and what a whole run has found."""
+"""Contract of a method (`Stepping`), its goal and outcome, and what a whole run has found."""
 
 import math
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
-from decimal import Decimal
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import (
-    ON_ERROR,
     Distribution,
     FloatArray,
     Inputs,
-    OnError,
     TermGradients,
     Terms,
-    check_name,
-    check_number,
-    check_whole,
 )
 from samplers.sample import (
     COARSE,
@@ -38,9 +32,6 @@ from samplers.sample import (
     clopper_pearson,
     normalise_weights,
 )
-
-if TYPE_CHECKING:
-    from samplers.run import Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,117 +329,6 @@ class Stepping(Protocol):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Estimate P[f(X) <= goal.gamma], X ~ inputs.base."""
-
-
-@dataclass(frozen=True)
-class RunArguments:
-    """Arguments of one run; their defaults are those of `estimate`, `Method.start` and the command line.
-
-    Raises:
-        ValueError: If an argument is out of range; the text says what was expected.
-
-    Example:
-        >>> from samplers.run import RunArguments
-        >>> arguments = RunArguments(max_sim=6000, seed=1)
-        >>> arguments.gamma, arguments.confidence, arguments.replicates
-        (0.0, 0.95, 1)
-        >>> RunArguments(confidence=95)
-        Traceback (most recent call last):
-            ...
-        ValueError: Expected confidence to be a number between 0 and 1, got 95.
-    """
-
-    gamma: float = 0.0
-    """Threshold of failure, f <= gamma."""
-    seed: int | None = None
-    """Same seed, same answer; None draws one."""
-    max_sim: int | None = None
-    """Simulations that are never exceeded, over all replicates; None leaves it to the method."""
-    target_cov: float | None = None
-    """Coefficient of variation to stop at; None leaves it to the method."""
-    confidence: float = Goal.confidence
-    """Nominal coverage of the interval."""
-    replicates: int = 1
-    """Independent runs, side by side."""
-    on_error: OnError = "raise"
-    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing but for the lower limit."""
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        check_number("gamma", self.gamma, -math.inf, math.inf)
-        check_number("confidence", self.confidence, 0.0, 1.0)
-        if self.target_cov is not None:
-            check_number("target_cov", self.target_cov, 0.0, math.inf)
-        check_whole("replicates", self.replicates, 1)
-        if self.max_sim is not None:
-            check_whole("max_sim", self.max_sim, self.replicates)
-            if self.max_sim > 10**12:  # more is a slip of the keyboard
-                raise ValueError(f"Expected max_sim to be at most {10**12:,}, got {Decimal(self.max_sim):.3g}.")
-        if self.seed is not None:
-            check_whole("seed", self.seed, 0)
-        check_name("on_error", self.on_error, list(ON_ERROR))
-
-
-@runtime_checkable
-class Method(Stepping, Protocol):
-    """A method to subclass: write `steps`, and `start` comes with it.
-
-    Example:
-        >>> import numpy as np, samplers
-        >>> class OneBatch(samplers.methods.Method):
-        ...     name, stops_at_target = "one-batch", False
-        ...     def steps(self, inputs, goal, rng):
-        ...         n = min(goal.budget, 4000)
-        ...         f = yield inputs.base.sample(n, rng)
-        ...         hits = int((f <= goal.gamma).sum())
-        ...         return samplers.methods.Outcome.of_counts(hits, n, goal.confidence, trace=())
-        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
-        >>> result = samplers.estimate(problem, OneBatch(), seed=0)
-        >>> result.n_sim, result.p
-        (4000, 0.01975)
-    """
-
-    def start(
-        self,
-        problem: Inputs,
-        gamma: float = RunArguments.gamma,
-        seed: int | None = RunArguments.seed,
-        max_sim: int | None = RunArguments.max_sim,
-        target_cov: float | None = RunArguments.target_cov,
-        confidence: float = RunArguments.confidence,
-        replicates: int = RunArguments.replicates,
-        on_error: OnError = RunArguments.on_error,
-    ) -> "Run":
-        """Start a run whose simulations you make yourself: `ask` for points, `tell` their outcomes.
-
-        Args:
-            problem: Has `dim` and `base`; `evaluate` is not needed.
-            gamma: As the others, see `samplers.estimate`, which gives the same result.
-            seed: Same seed, same answer.
-            max_sim: Simulations that are never asked for more of.
-            target_cov: Coefficient of variation to stop at.
-            confidence: Nominal coverage of the interval.
-            replicates: Independent runs, side by side in every batch.
-            on_error: What NaN among the outcomes means.
-
-        Raises:
-            ValueError: If an argument is not as described in `estimate`.
-
-        Example:
-            >>> import samplers
-            >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
-            >>> run = samplers.MonteCarlo(batch=1000).start(problem, seed=0, max_sim=2000)
-            >>> while not run.done:
-            ...     x = run.ask()
-            ...     print(x.shape)
-            ...     run.tell(2.0 - x[:, 0])
-            (1000, 2)
-            (1000, 2)
-        """
-        from samplers.run import Run  # which makes sums of methods
-
-        arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
-        return Run(problem, self, arguments)
 
 
 @dataclass(frozen=True)

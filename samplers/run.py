@@ -3,19 +3,24 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.reweight import check_refits
 from samplers.analysis.weighted import estimate_known
-from samplers.method import Answer, Goal, Outcome, Request, RunArguments, Stepping, TermsOffer
+from samplers.method import Answer, Goal, Outcome, Request, Stepping, TermsOffer
 from samplers.problem import (
+    ON_ERROR,
     Distribution,
     EvaluationError,
     FloatArray,
     Inputs,
+    OnError,
     TermGradients,
+    check_name,
+    check_number,
     check_whole,
     describe_point,
     names_of_columns,
@@ -82,6 +87,55 @@ class Progress:
 
 
 Listener = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class RunArguments:
+    """Arguments of one run; their defaults are those of `estimate`, `Method.start` and the command line.
+
+    Raises:
+        ValueError: If an argument is out of range; the text says what was expected.
+
+    Example:
+        >>> from samplers.run import RunArguments
+        >>> arguments = RunArguments(max_sim=6000, seed=1)
+        >>> arguments.gamma, arguments.confidence, arguments.replicates
+        (0.0, 0.95, 1)
+        >>> RunArguments(confidence=95)
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected confidence to be a number between 0 and 1, got 95.
+    """
+
+    gamma: float = 0.0
+    """Threshold of failure, f <= gamma."""
+    seed: int | None = None
+    """Same seed, same answer; None draws one."""
+    max_sim: int | None = None
+    """Simulations that are never exceeded, over all replicates; None leaves it to the method."""
+    target_cov: float | None = None
+    """Coefficient of variation to stop at; None leaves it to the method."""
+    confidence: float = Goal.confidence
+    """Nominal coverage of the interval."""
+    replicates: int = 1
+    """Independent runs, side by side."""
+    on_error: OnError = "raise"
+    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing but for the lower limit."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_number("gamma", self.gamma, -math.inf, math.inf)
+        check_number("confidence", self.confidence, 0.0, 1.0)
+        if self.target_cov is not None:
+            check_number("target_cov", self.target_cov, 0.0, math.inf)
+        check_whole("replicates", self.replicates, 1)
+        if self.max_sim is not None:
+            check_whole("max_sim", self.max_sim, self.replicates)
+            if self.max_sim > 10**12:  # more is a slip of the keyboard
+                raise ValueError(f"Expected max_sim to be at most {10**12:,}, got {Decimal(self.max_sim):.3g}.")
+        if self.seed is not None:
+            check_whole("seed", self.seed, 0)
+        check_name("on_error", self.on_error, list(ON_ERROR))
 
 
 def check_problem(problem: Inputs, *needed: str) -> None:

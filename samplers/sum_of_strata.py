@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, offer_of
-from samplers.methods.monte_carlo import MonteCarlo
+from samplers.plain_draws import PlainDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     DISAGREEMENT_LEVEL,
@@ -135,7 +135,7 @@ class _Sum:
         sizes = [int(n * self.parts[i].share / sum(self.parts[k].share for k in empty)) for i in empty]
         for i, size in zip(empty, sizes, strict=True):
             if not self.stopped and size > 0.1 * self.parts[i].n_sim:  # a tenth of the simulations made
-                yield from self._run(i, size, None, MonteCarlo())
+                yield from self._run(i, size, None, PlainDraws())
         whole = sum_strata(self.parts, self.goal.confidence, tuple(self.trace))
         for last in self.trace[-1:]:  # levels of a run do not know the pilot
             self.goal.on_level(replace(last, estimate=whole.p))
@@ -145,7 +145,7 @@ class _Sum:
         """Return a first run for every stratum, or for the largest ones if there are fewer simulations."""
         k, n, target = len(self.parts), self.goal.max_sim, self.goal.target_cov
         target = max(target, PILOT_COV) if target is not None and self.method.stops_at_target else None
-        method = MonteCarlo() if self.chooses else None
+        method = PlainDraws() if self.chooses else None
         if n is None:
             return [(i, PILOT_DRAWS if self.chooses else None, target, method) for i in range(k)]
         few = n < 20 * k  # no pilots: all are made at once, in equal parts
@@ -188,7 +188,7 @@ class _Sum:
             rare = []
         self.searched |= seldom - {*rare}
         if left is None and target is None:
-            draws = {i: (self.plain_draws, None, MonteCarlo()) for i in range(k) if i not in rare}
+            draws = {i: (self.plain_draws, None, PlainDraws()) for i in range(k) if i not in rare}
             return [(i, *draws.get(i, (None, None, None))) for i in range(k)]
         if not rare:
             return self._plan_more()
@@ -205,7 +205,7 @@ class _Sum:
         """Return plain draws for a stratum that often fails, or that was searched in vain; else None."""
         drawn = self.parts[stratum].outcome.counts is not None
         in_vain = stratum in self.searched and (drawn or self._is_unresolved(stratum))
-        return MonteCarlo() if self.chooses and (self._fails_often(stratum) or in_vain) else None
+        return PlainDraws() if self.chooses and (self._fails_often(stratum) or in_vain) else None
 
     def _is_unresolved(self, stratum: int) -> bool:
         """Return whether simulations of a stratum have met no failure, or too few to say how likely they are."""

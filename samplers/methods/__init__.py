@@ -13,8 +13,8 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from samplers.mcmc import RootedPoints
-from samplers.method import Choice, Goal, Interrupted, Method, Outcome, Part, Stepping, Steps, offer_of
-from samplers.methods.base import noise_mask
+from samplers.method import Choice, Goal, Interrupted, Outcome, Part, Stepping, Steps, offer_of
+from samplers.methods.base import Method, noise_mask
 from samplers.methods.cross_entropy import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy

@@ -1,4 +1,4 @@
-"""What methods share: their way to f, and the coordinates that are searched, noise drawn afresh for every point.
+"""Method: the base class of the methods; their way to f, and the coordinates that are searched, noise drawn afresh.
 
 The randomness of learned drivers is hundreds of coordinates of x that are standard normal and matter little one by one.
 No proposal describes failures in so many dimensions; drawn from their own distribution they cost nothing: with
@@ -8,16 +8,77 @@ Z ~ N(0, I) for the noise, p = E[P(f(X, Z) <= gamma | X)], and weights are those
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.bases import DrawnByItsMap
-from samplers.method import Goal
-from samplers.problem import FloatArray, Inputs
+from samplers.method import Goal, Stepping
+from samplers.problem import FloatArray, Inputs, OnError
 from samplers.proposals import MixtureComponent
+from samplers.run import Run, RunArguments
 from samplers.sample import Level
+
+
+@runtime_checkable
+class Method(Stepping, Protocol):
+    """A method to subclass: write `steps`, and `start` comes with it.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> class OneBatch(samplers.methods.Method):
+        ...     name, stops_at_target = "one-batch", False
+        ...     def steps(self, inputs, goal, rng):
+        ...         n = min(goal.budget, 4000)
+        ...         f = yield inputs.base.sample(n, rng)
+        ...         hits = int((f <= goal.gamma).sum())
+        ...         return samplers.methods.Outcome.of_counts(hits, n, goal.confidence, trace=())
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, OneBatch(), seed=0)
+        >>> result.n_sim, result.p
+        (4000, 0.01975)
+    """
+
+    def start(
+        self,
+        problem: Inputs,
+        gamma: float = RunArguments.gamma,
+        seed: int | None = RunArguments.seed,
+        max_sim: int | None = RunArguments.max_sim,
+        target_cov: float | None = RunArguments.target_cov,
+        confidence: float = RunArguments.confidence,
+        replicates: int = RunArguments.replicates,
+        on_error: OnError = RunArguments.on_error,
+    ) -> Run:
+        """Start a run whose simulations you make yourself: `ask` for points, `tell` their outcomes.
+
+        Args:
+            problem: Has `dim` and `base`; `evaluate` is not needed.
+            gamma: As the others, see `samplers.estimate`, which gives the same result.
+            seed: Same seed, same answer.
+            max_sim: Simulations that are never asked for more of.
+            target_cov: Coefficient of variation to stop at.
+            confidence: Nominal coverage of the interval.
+            replicates: Independent runs, side by side in every batch.
+            on_error: What NaN among the outcomes means.
+
+        Raises:
+            ValueError: If an argument is not as described in `estimate`.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+            >>> run = samplers.MonteCarlo(batch=1000).start(problem, seed=0, max_sim=2000)
+            >>> while not run.done:
+            ...     x = run.ask()
+            ...     print(x.shape)
+            ...     run.tell(2.0 - x[:, 0])
+            (1000, 2)
+            (1000, 2)
+        """
+        arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
+        return Run(problem, self, arguments)
 
 
 def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:

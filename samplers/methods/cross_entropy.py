@@ -10,7 +10,8 @@ import numpy as np
 from samplers.bases import Gaussian
 from samplers.distributions import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.importance import Search
-from samplers.method import Goal, Method, Steps
+from samplers.method import Goal, Steps
+from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, check_settings, is_number
 from samplers.sample import Status, next_level, normalise_weights
 

@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from samplers.importance import Search
-from samplers.method import Goal, Method, Steps
+from samplers.method import Goal, Steps
+from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.proposals import Gaussian, ProposalDistribution
 from samplers.sample import Status, next_level, normalise_weights

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from samplers.importance import Search
-from samplers.method import Goal, Method, Steps
+from samplers.method import Goal, Steps
+from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.proposals import (
     Mixture,

@@ -9,7 +9,8 @@ import numpy as np
 
 from samplers.importance import COARSE_ESS
 from samplers.mcmc import Chains, Kernel, NextLevel, RootedPoints, descend, independent_chains, judge_levels
-from samplers.method import Goal, Method, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Outcome, Steps, no_outcome_share
+from samplers.methods.base import Method
 from samplers.problem import Inputs, check_settings
 from samplers.sample import Layer, Level, Sample, Status, clopper_pearson, next_level
 

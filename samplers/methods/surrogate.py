@@ -19,11 +19,11 @@ from scipy.special import logsumexp, ndtri
 
 from samplers.bases import Gaussian
 from samplers.importance import Draws, count_final_draws, weighted_interval
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps
-from samplers.methods.base import SimulationSteps, Simulator, marginalise_noise
+from samplers.method import Goal, Interrupted, Outcome, Steps
+from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.kriging import MANY_DIMS, Kriging, Prediction, fit_kriging
-from samplers.methods.monte_carlo import KeptDraws, MonteCarlo
 from samplers.methods.two_stage.regions import count_lineages
+from samplers.plain_draws import KeptDraws, PlainDraws
 from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Mixture, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import (
@@ -199,7 +199,7 @@ class SurrogateRun:
         """Spend the rest on base draws; those of the design do not count, for they may have decided it."""
         left = self.budget - len(self.f)
         goal = self.goal if self.goal.max_sim is None else replace(self.goal, max_sim=left)
-        outcome = yield from self.go_on(MonteCarlo(n=left, batch=left).steps(self.whole, goal, self.rng))
+        outcome = yield from self.go_on(PlainDraws(n=left, batch=left).steps(self.whole, goal, self.rng))
         return replace(outcome, counts=None)  # no share of draws to be pooled: this run came to it by chance
 
     def go_on(self, steps: Steps) -> Steps:

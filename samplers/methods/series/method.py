@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.importance import Draws, weighted_interval
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps, offer_of, request_terms
-from samplers.methods.base import SearchRun, SimulationSteps
-from samplers.methods.monte_carlo import MonteCarlo
+from samplers.method import Goal, Interrupted, Outcome, Steps, offer_of, request_terms
+from samplers.methods.base import Method, SearchRun, SimulationSteps
 from samplers.methods.series import ROUNDS, WALKS
 from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
 from samplers.methods.series.walks import TermSimulator, plan_walks, walk_downhill
 from samplers.methods.subset import spend_on_subset_simulation
+from samplers.plain_draws import PlainDraws
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.proposals import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
 from samplers.sample import DrawWeights, Status, binomial_cov, clopper_pearson
@@ -180,7 +180,7 @@ class SeriesRun(SearchRun):
         budget = self.budget
         if budget < ROUNDS.min_budget:
             goal = replace(self.goal, max_sim=self.end)
-            outcome = yield from MonteCarlo(n=budget, batch=budget).steps(self.inputs, goal, self.rng)
+            outcome = yield from PlainDraws(n=budget, batch=budget).steps(self.inputs, goal, self.rng)
             about = f"{budget} simulations are too few for a search ({ROUNDS.min_budget}): base draws only."
             return outcome.remark_first(about)
         yield from self._draw_base()
@@ -189,7 +189,7 @@ class SeriesRun(SearchRun):
             if base_rate >= 0.1:  # plain Monte Carlo is as good as anything; those made so far decided on it
                 left, batch = self.left_at_all, 10_000 if self.goal.target_cov is None else ROUNDS.target_batch
                 goal = replace(self.goal, max_sim=left)
-                plain = MonteCarlo(n=left, batch=batch).steps(self.inputs, goal, self.rng)
+                plain = PlainDraws(n=left, batch=batch).steps(self.inputs, goal, self.rng)
                 return (yield from self._leave_rest(plain))
             yield from self._walk()
             # draw and refit until the failures of all terms are known, or the rest is for the estimate

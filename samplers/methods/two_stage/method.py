@@ -9,15 +9,15 @@ import numpy as np
 
 from samplers.importance import Draws, weighted_interval
 from samplers.mcmc import RootedPoints
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps
+from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import (
     ComponentDraws,
+    Method,
     SearchRun,
     SimulationSteps,
     Simulator,
     marginalise_noise,
 )
-from samplers.methods.monte_carlo import KeptDraws
 from samplers.methods.subset import FEWEST_LEVELS, spend_on_subset_simulation
 from samplers.methods.two_stage.exploration import Sizes, draw_isotropic, find_regions, find_slopes
 from samplers.methods.two_stage.mixture import MixtureProposal
@@ -39,6 +39,7 @@ from samplers.methods.two_stage.stratified import (
     check_rounds,
     describe_discovery,
 )
+from samplers.plain_draws import KeptDraws
 from samplers.problem import Inputs, check_settings
 from samplers.sample import Interval, Status, add_unseen, binomial_cov, effective_sample_size
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 import samplers
+from samplers import plain_draws as kept_draws
 from samplers.method import Goal
-from samplers.methods import monte_carlo as kept_draws
-from samplers.methods.monte_carlo import KeptDraws
+from samplers.plain_draws import KeptDraws
 
 
 def test_draws_from_the_base_itself():
