@@ -7,7 +7,8 @@ driver model with and without its headway rule, the IDM and the shipped egos, an
 (`near_crash`); takes away parts of the model one at a time; compares per event and per million km with people's counts
 by precipitating event (`rare_envs.people.people_in`); and says which targets are met. It writes
 benchmarks/results/human_calibration.json, rare_envs/data/human_calibration.json (what the package prints beside rates)
-and the end of docs/human_driver.md; with --no-drive from the cells of the last run.
+and the end of docs/human_driver.md; with --no-drive from the cells of the last run, with --stratum from these but for
+those of one stratum.
 
 People's counts are those of all roads; how often the events happen is the `EventFrequency` of the base distribution. No
 constant of the model or of the scenarios may be changed because of what is printed here without saying so on the page.
@@ -434,6 +435,7 @@ def main(
     draws: Annotated[int, typer.Option(help="Draws of `human` where contacts are rarest.")] = 1_000_000,
     site: Annotated[list[str] | None, typer.Option(help="Site; the first one's changes are driven too.")] = None,
     ego: Annotated[list[str] | None, typer.Option(help="These egos and not the shipped ones, such as ppo.zip.")] = None,
+    stratum: Annotated[list[str] | None, typer.Option(help="These alone; of others the last run's cells stay.")] = None,
     changes: Annotated[bool, typer.Option(help="Whether to take parts away.")] = True,
     workers: int = 2,
     seed: int = 0,
@@ -445,15 +447,17 @@ def main(
     options = {"draws": [str(draws)], "site": site or [], "ego": ego or [], "seed": [str(seed)]}
     given = "".join(f" --{name} {value}" for name, values in options.items() for value in values)
     command = f"python -m benchmarks.driving.human_calibration{given}"
-    if drive:
-        cells = []
-        for cell in count(plan(sites, draws, egos, changes), seed, workers):
-            cells.append(cell)
-            print(cell, flush=True)
-        about = {"command": command, "version": rare_envs.__version__, "model": asdict(HUMAN_EGOS[HUMAN].model)}
-    else:
+    about: dict[str, Any] = {"command": command, "version": rare_envs.__version__}
+    about |= {"model": asdict(HUMAN_EGOS[HUMAN].model), "verdicts": [], "cells": []}
+    if stratum or not drive:
         about = json.loads(CALIBRATION_RESULT.read_text(encoding="utf-8"))
-        cells, command = [CalibrationCell(**each) for each in about["cells"]], about["command"]
+        command = about["command"]
+    known = {Drawn(*list(each.values())[:4]): CalibrationCell(**each) for each in about["cells"]}
+    planned = [each for each in plan(sites, draws, egos, changes) if not stratum or each[0].stratum in stratum]
+    for cell in count(planned, seed, workers) if drive else ():
+        known[Drawn(cell.site, cell.stratum, cell.ego, cell.change)] = cell
+        print(cell, flush=True)
+    cells = list(known.values())
     measured = format_measured(cells, sites, command)
     print(measured)
     if write:

@@ -2,6 +2,7 @@
 
     python -m benchmarks.estimators.truth --rollouts 3e8 --workers 2
     python -m benchmarks.estimators.truth --only strata --rollouts 3e7
+    python -m benchmarks.estimators.truth --only unseen --rollouts 1e7
     python -m benchmarks.estimators.truth --ego runs/demo/ego.zip --rollouts 1e6
 
 writes `benchmarks/results/truth.json`, which the tests of the samplers compare with: of the IDM by default, of another
@@ -115,11 +116,11 @@ def main(
     rollouts: Annotated[float, typer.Option(help="Rollouts for each.")] = 1e7,
     seed: int = 2026,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    only: Annotated[str, typer.Option(help='"results", the scenarios of one density, or "strata".')] = "",
+    only: Annotated[str, typer.Option(help='"results", the scenarios of one density; "strata", or one of these.')] = "",
     ego: Annotated[str, typer.Option(help="Name or file; another than the IDM by stratum, with plain draws.")] = "idm",
     out: Path = TRUTH_RESULT,
 ) -> None:
-    """Measure all, or one of the groups, and write the result; other groups stay."""
+    """Measure all, or one of the groups or strata, and write the result; others stay."""
     found = json.loads(out.read_text()) if out.exists() else {}
     versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
     command = " ".join(["python -m benchmarks.estimators.truth", *sys.argv[1:]])
@@ -128,10 +129,13 @@ def main(
     if ego != "idm":
         groups = {ego: tuple(world._replace(ego=ego, wide=1.0) for world in STRATA)}
     for group, worlds in groups.items():
-        for number, world in enumerate(worlds if only in ("", group) else ()):
-            row = truth(world, int(rollouts), seed, workers)
+        rows = {(row["env_id"], row["base"], row.get("stratum", "")): row for row in found.get(group, ())}
+        for world in worlds:
+            if only not in ("", group, world.stratum):
+                continue
+            row = rows[world[:3]] = truth(world, int(rollouts), seed, workers)
             print(json.dumps(row), flush=True)
-            found[group] = [*(found.get(group, []) if number else []), row]
+            found[group] = list(rows.values())
             out.write_text(json.dumps(found, indent=2) + "\n")
 
 

@@ -2,7 +2,7 @@
 
 from rare_envs.distributions.acceptance import AcceptedGaps
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates, Difference
+from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates, Difference, RoomToBrake
 from rare_envs.distributions.events import EventCounts, EventFrequency, PredictiveCheck
 from rare_envs.distributions.fitted import FittedDistribution, join_independent
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
@@ -26,6 +26,7 @@ __all__ = [
     "Parameter",
     "PredictiveCheck",
     "ProductDistribution",
+    "RoomToBrake",
     "ScenarioSpace",
     "StratifiedDistribution",
     "Stratum",

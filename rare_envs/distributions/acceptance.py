@@ -106,7 +106,7 @@ class AcceptedGaps:
 
     def __post_init__(self) -> None:
         own = self.mixture.coordinates
-        given = [(each.column, each.earlier) for each in own.within]
+        given = [each[:2] for each in own.within]
         if own.order[:2] != ("cut_in_speed", "cut_in_gap") or given != [("ego_speed", "cut_in_speed")]:
             raise ValueError("Expected an order that begins with cut_in_speed and cut_in_gap, and the cutter's range.")
         if not own.is_log(own.names.index("cut_in_gap")) or not self.limit > 0.0:

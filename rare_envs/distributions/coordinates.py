@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -56,6 +56,36 @@ class Difference(NamedTuple):
     most: float
     """column - earlier is from least to most."""
 
+    def range_in(self, column: Callable[[str], Any]) -> tuple[Any, Any]:
+        """Return the ends of the later column, of what returns the values of another, (n,)."""
+        other = column(self.earlier)
+        return other + self.least, other + self.most
+
+
+class RoomToBrake(NamedTuple):
+    """Room behind a vehicle ahead for who follows it: its hardest braking avoids a contact if the other keeps speed.
+
+    column + beside >= least + max(behind - ahead, 0)^2 / (2 braking) cuts the range of a gap, plain or in logarithms.
+
+    Example:
+        >>> room = RoomToBrake("lead_gap", "cut_in_gap", "ego_speed", "lead_speed", least=-4.0, braking=8.0)
+        >>> start = {"cut_in_gap": -8.0, "ego_speed": 20.0, "lead_speed": 12.0}  # a cutter of 5 m beside the ego
+        >>> room.range_in(start.get)[0]  # to its lead, which is 1 + 4 m ahead of the ego
+        8.0
+    """
+
+    column: str
+    beside: str
+    behind: str
+    ahead: str
+    least: float
+    braking: float
+
+    def range_in(self, column: Callable[[str], Any]) -> tuple[Any, Any]:
+        """Return the ends of the gap, of what returns the values of another column, (n,)."""
+        closing = np.maximum(column(self.behind) - column(self.ahead), 0.0)
+        return self.least - column(self.beside) + closing * closing / (2.0 * self.braking), np.inf
+
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
@@ -70,7 +100,7 @@ class Coordinates:
         kinds: Kind of the coordinate of each column of x, d of them; plain ones by default.
         names: Names of the columns of x; needed where a coordinate or the order names one.
         order: Names of the columns in the order of the coordinates; the order of x by default.
-        within: Ranges of differences of two columns, see `Difference`; none by default.
+        within: What cuts ranges by earlier columns, see `Difference` and `RoomToBrake`; nothing by default.
         origins: What is subtracted from each column whose logarithm is its coordinate, d of them; 0 by default.
 
     Raises:
@@ -94,7 +124,7 @@ class Coordinates:
     kinds: tuple[CoordinateKind, ...] = ()
     names: tuple[str, ...] = ()
     order: tuple[str, ...] = ()
-    within: tuple[Difference, ...] = ()
+    within: tuple[Difference | RoomToBrake, ...] = ()
     origins: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -109,8 +139,9 @@ class Coordinates:
         self._check_columns()
         for j, kind in enumerate(self.kinds):
             self._check_kind(self.names[j] if self.names else f"column {j}", j, kind)
-        object.__setattr__(self, "within", tuple(Difference(*each) for each in self.within))
-        self._check_differences()
+        cuts = tuple(Difference(*each) if len(each) == 4 else RoomToBrake(*each) for each in self.within)
+        object.__setattr__(self, "within", cuts)
+        self._check_within()
 
     @property
     def dim(self) -> int:
@@ -129,7 +160,7 @@ class Coordinates:
         All probability of a range that vanishes is at a point, where the density would have no bound.
         """
         low, high = self.low.copy(), self.high.copy()
-        for each in self.within:
+        for each in (cut for cut in self.within if isinstance(cut, Difference)):
             later, earlier = self.names.index(each.column), self.names.index(each.earlier)
             least = LEAST_RANGE * min(self.high[later] - self.low[later], each.most - each.least)
             high[earlier] = min(high[earlier], self.high[later] - each.least - least)
@@ -157,8 +188,8 @@ class Coordinates:
         ends = self.ends[0][j], self.ends[1][j]
         for each in self.within:
             if self.names[j] == each.column:
-                other = np.ascontiguousarray(x[:, self.names.index(each.earlier)])
-                ends = np.maximum(ends[0], other + each.least), np.minimum(ends[1], other + each.most)
+                low, high = each.range_in(lambda name: np.ascontiguousarray(x[:, self.names.index(name)]))
+                ends = np.maximum(ends[0], low), np.minimum(ends[1], high)
         return ends
 
     def bounds(self, j: int, x: FloatArray) -> tuple[Any, Any]:
@@ -275,16 +306,21 @@ class Coordinates:
                 f"got {', '.join(self.order)}."
             )
 
-    def _check_differences(self) -> None:
-        """Raise a ValueError unless differences are of columns in their order, and leave each column a range."""
+    def _check_within(self) -> None:
+        """Raise a ValueError unless ranges are cut by columns earlier in the order, and leave each column a range."""
+        order = [self.names[j] for j in self.columns] if self.names else []
         for each in self.within:
-            known = [self.names[j] for j in self.columns] if self.names else []
-            later = known[known.index(each.earlier) + 1 :] if each.earlier in known else []
-            if each.column not in later or isinstance(self.kinds[self.names.index(each.column)], ClosingSpeed):
-                raise ValueError(f"Expected within of a column after {each.earlier!r} in order, got {each.column!r}.")
-            if not each.least < each.most:
+            last: tuple[str, ...] = each[1:2] if isinstance(each, Difference) else each[1:4]
+            known = order[: order.index(each.column)] if each.column in order else []
+            if not {*last} <= {*known} or isinstance(self.kinds[self.names.index(each.column)], ClosingSpeed):
+                raise ValueError(f"Expected within of a column after {', '.join(last)} in order, got {each.column!r}.")
+            if isinstance(each, Difference) and not each.least < each.most:
                 raise ValueError(f"Expected a range of {each.column} - {each.earlier}, got {each.least}, {each.most}.")
-        low, high = self.ends
+        low, high = self.ends[0].copy(), self.ends[1]
+        for each in (cut for cut in self.within if isinstance(cut, RoomToBrake)):
+            ends = {name: (high if name == each.behind else low)[self.names.index(name)] for name in each[1:4]}
+            j = self.names.index(each.column)
+            low[j] = max(low[j], each.range_in(ends.__getitem__)[0])
         if (low >= high).any():
             j = int(np.argmax(low >= high))
             raise ValueError(f"within leaves {self.names[j]} no range: from {low[j]:g} to {high[j]:g}.")

@@ -126,7 +126,7 @@ class MappedMixture:
     def _set(self, j: int, column: TruncatedConditional, y: FloatArray, x: FloatArray) -> None:
         """Set column j of rows x to what belongs to its coordinate y (n,), inside the box."""
         value = self.coordinates.value(j, move_inside(y, column.low, column.high), x)
-        x[:, j] = move_inside(value, *(end[j] for end in self.coordinates.ends))
+        x[:, j] = move_inside(value, *self.coordinates.range_of(j, x))
 
     def _conditionals(self, x: FloatArray) -> Iterator[tuple[int, TruncatedConditional]]:
         """Yield columns and their distributions given the earlier ones of x (n, d), which may be set on the way."""
@@ -155,9 +155,8 @@ class MappedMixture:
                 out[end - size : end] = array
         is_log = np.repeat([part.coordinates.is_log(j) for part in self.parts], sizes)[:, None]
         log_weights, mean, scale = joined
-        return TruncatedConditional(
-            log_weights, mean, scale, self.low[j], self.high[j], is_log if is_log.any() else None
-        )
+        ends = self.coordinates.range_of(j, x)
+        return TruncatedConditional(log_weights, mean, scale, *ends, is_log if is_log.any() else None)
 
 
 class Walk:
@@ -404,7 +403,7 @@ class PooledMixture(MappedMixture):
         """Pool mixtures with the columns in the same order."""
         own = parts[0].coordinates
         self.parts, self.shares, self.low, self.high = tuple(parts), shares, own.low, own.high
-        self.coordinates = Coordinates(own.low, own.high, names=own.names, order=own.order)
+        self.coordinates = Coordinates(own.low, own.high, names=own.names, order=own.order, within=own.within)
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
         """Return the log density, (n, d) -> (n,); -inf outside the box."""

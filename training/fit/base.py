@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -124,7 +124,7 @@ def fit_base(
 
 def _check_numbers(scenario: str, events: EventSet, fitted: Distribution) -> None:
     """Raise a `NoSpread` that names the narrowest parameter if the numbers of a fit are too inexact for estimates."""
-    box, fault = recorded_parameters(scenario), find_base_fault(fitted, len(find_scenario(scenario).parameters))
+    box, fault = recorded_parameters(scenario), find_base_fault(fitted, cast(Any, fitted).dim)
     if fault is not None:
         spreads = [*events.joint.std(axis=0), *events.apart.std(axis=0)]
         pairs = list(zip(spreads, box, strict=False))

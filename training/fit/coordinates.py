@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates, Difference
+from rare_envs.distributions.coordinates import ClosingSpeed, CoordinateKind, Coordinates, Difference, RoomToBrake
 from rare_envs.distributions.events import PredictiveCheck
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, Parameter
@@ -121,8 +121,8 @@ class CoordinateSystem:
     """Kind of the coordinate by parameter; plain if none is given."""
     order: tuple[str, ...] = ()
     """Parameters in the order of the coordinates; that of x if empty."""
-    within: tuple[Difference, ...] = ()
-    """Ranges of differences of parameters."""
+    within: tuple[Difference | RoomToBrake, ...] = ()
+    """What cuts ranges of parameters by others."""
     origins: Mapping[str, float] = field(default_factory=dict)
     """What is subtracted from a parameter whose logarithm is its coordinate; 0 if nothing is given."""
 
@@ -135,7 +135,7 @@ class CoordinateSystem:
             kinds=tuple(self.kinds.get(name, "plain") for name in names),
             names=names,
             order=tuple(name for name in self.order if name in names),
-            within=self.within,
+            within=tuple(each for each in self.within if each.column in names),
             origins=tuple(self.origins.get(name, 0.0) for name in names),
         )
 

@@ -26,8 +26,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.control.human_driver import MAX_HUMAN_BRAKING
 from rare_envs.distributions.acceptance import AcceptedGaps, needed_after
-from rare_envs.distributions.coordinates import Coordinates, Difference
+from rare_envs.distributions.coordinates import Coordinates, Difference, RoomToBrake
 from rare_envs.distributions.events import EventFrequency, PredictiveCheck
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution
@@ -35,6 +36,7 @@ from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.distributions.stratified import CutNormals, StratifiedDistribution, Stratum
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.fit.acceptance import LEAST_LIMIT, MOST_LIMIT, check_starts_vary, fit_accepted, profile_limit
 from training.fit.checks import (
@@ -77,9 +79,11 @@ differ, and fill files."""
 UNSEEN_SYSTEM = CoordinateSystem(
     "log (gap + 12 m), log lead gap",
     {"cut_in_gap": "log", "lead_gap": "log", "duration": "log"},
+    within=(RoomToBrake("lead_gap", "cut_in_gap", "ego_speed", "lead_speed", 1.0 - VEHICLE_LENGTH, MAX_HUMAN_BRAKING),),
     origins={"cut_in_gap": -12.0},
 )
-"""Gaps begin with two lengths of bodies below 0, about which a mixture of plain gaps spills over; 12 m is assumed."""
+"""Gaps begin with two lengths of bodies below 0, about which a mixture of plain gaps spills over; 12 m is assumed. The
+ego is at least 1 m behind its own lead, past the cutter beside it, and would not run into that one whoever cuts in."""
 LEAST_STARTS, LEAST_COURSES, LEAST_BRAKINGS = 10, 3, 10
 """Events that a fit needs; a stratum of fewer brakings is left out."""
 STOP_LOSS_SPREAD = 1e4
@@ -148,9 +152,9 @@ def find_neighbours(
 
 
 def keep_neighbours(scenario: str, rows: FloatArray, clusters: NDArray[np.int64], near: float) -> Neighbours:
-    """Return neighbours within the scenario's ranges."""
+    """Return neighbours within the ranges of the scenario, whose own lead leaves them room to brake."""
     box = recorded_parameters(scenario, tuple(find_scenario(scenario).parameters)[3].low)[:5]
-    keep = np.logical_and.reduce([(rows[:, j] >= p.low) & (rows[:, j] <= p.high) for j, p in enumerate(box)])
+    keep = UNSEEN_SYSTEM.coordinates(box).contains(rows).all(axis=1)
     return Neighbours(rows[keep], clusters[keep], near)
 
 

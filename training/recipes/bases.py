@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions.events import EventFrequency
-from rare_envs.distributions.fitted import FittedDistribution, join_independent
+from rare_envs.distributions.fitted import join_independent
 from rare_envs.distributions.stratified import CutNormals
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.traffic.state import VEHICLE_LENGTH
@@ -162,22 +162,13 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
     frequency = None if known is None else replace(EventFrequency(**known), **counted)
     asked: dict[str, Any] = {"frequency": frequency, "n_refits": n_refits, "seed": seed}
     stratified = base.scenario == CUT_IN_V1 and not base.test
-    asked["neighbours"] = read_neighbours(data, str(base.changes)) if stratified else None
+    asked |= {"neighbours": read_neighbours(data, str(base.changes))} if stratified else {}
     fitted = fit_base(base.scenario, events, source, COMMAND, system=base.system, **asked)
     if base.test or base.scenario == CUT_IN_V0:
         fitted = replace(fitted, record={**fitted.record, "kind": TEST_KIND})
-    fitted = _add_attitudes(fitted) if base.test else fitted
-    return format_base(base.scenario, fitted.to_dict())
-
-
-def _add_attitudes(fitted: FittedDistribution) -> FittedDistribution:
-    """Return a distribution of starts, from which nobody was refused, with standard normal attitudes behind."""
-    free = CutNormals(np.full(ATTITUDES, -np.inf), np.full(ATTITUDES, np.inf))
-    return replace(
-        fitted,
-        distribution=join_independent(fitted.distribution, free),
-        refits=tuple(join_independent(each, free) for each in fitted.refits),
-    )
+    free = np.full(ATTITUDES, np.inf)  # attitudes of cutters who refuse no gap
+    whole: Any = join_independent(fitted, CutNormals(-free, free)) if base.test else fitted
+    return format_base(base.scenario, whole.to_dict())
 
 
 def read_neighbours(folder: Path, site: str) -> Neighbours:

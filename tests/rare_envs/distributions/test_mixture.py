@@ -360,6 +360,98 @@ def test_density_and_draws_with_a_difference_agree_where_its_range_vanishes(mean
         Coordinates(**{**made, "low": [9.95, 0.0], "high": [20.0, 10.0]}, within=(("speed", "loss", 0.0, 10.0),))
 
 
+def make_queue(seed: int, names: tuple[str, ...]) -> TruncatedGaussianMixture:
+    """Return an ego, a cutter beside it (5 m long) and the ego's lead, which leaves 1 m and room to brake at 7.6 m/s^2.
+
+    In many of the draws that are not cut the lead would be inside the ego, or be run into.
+    """
+    rng = np.random.default_rng(seed)
+    room = ("lead_gap", "cut_in_gap", "ego_speed", "lead_speed", -4.0, 7.6)
+    coordinates = Coordinates(
+        low=[0.0, 0.0, -10.0, 1.0][: len(names)],
+        high=[45.0, 45.0, 120.0, 150.0][: len(names)],
+        kinds=("plain", "plain", "plain", "log")[: len(names)],
+        names=names,
+        within=(room,) if "lead_gap" in names else (),
+    )
+    d = len(names)
+    roots = np.linalg.qr(rng.standard_normal((2, 4, 4)))[0][:, :d] * 2.0
+    covariances = roots @ roots.transpose(0, 2, 1) + np.diag([9.0, 9.0, 4.0, 0.4][:d])
+    return TruncatedGaussianMixture(
+        [0.6, 0.4], [[m, 14.0, -6.0, 1.5][:d] for m in (16.0, 20.0)], covariances, coordinates=coordinates
+    )
+
+
+QUEUE_NAMES = ("ego_speed", "lead_speed", "cut_in_gap", "lead_gap")
+
+
+def test_room_to_brake_cuts_the_law_where_the_lead_would_be_in_the_ego() -> None:
+    """The density over the gap adds up to that of the other columns; maps are exact; draws are of the law."""
+    queue = make_queue(5, QUEUE_NAMES)
+    x = queue.sample(20_000, np.random.default_rng(0))
+    closing, room = np.maximum(x[:, 0] - x[:, 1], 0.0), x[:, 2] + 5.0 + x[:, 3]
+    assert (room >= 1.0 + closing**2 / 15.2 - 1e-9).all() and (room < 2.0).any()
+    u = queue.to_standard_normal(x)
+    assert min(stats.kstest(u[:, j], "norm").pvalue for j in range(4)) > 1e-4
+    assert np.abs(np.corrcoef(u.T) - np.eye(4)).max() < 4.5 / np.sqrt(len(u))
+    other = queue.from_standard_normal(np.random.default_rng(1).standard_normal((20_000, 4)))
+    assert min(stats.ks_2samp(x[:, j], other[:, j]).pvalue for j in range(4)) > 1e-4
+    far = np.clip(2.5 * np.random.default_rng(2).standard_normal((2000, 4)), -6.0, 6.0)
+    assert np.abs(queue.to_standard_normal(queue.from_standard_normal(far)) - far).max() < 1e-7
+    others = make_queue(5, QUEUE_NAMES[:3])
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    for row in x[:20]:
+        low = max(1.0, -4.0 - row[2] + max(row[0] - row[1], 0.0) ** 2 / 15.2)
+        log_gap = 0.5 * (np.log(150.0) + np.log(low) + (np.log(150.0) - np.log(low)) * nodes)
+        gaps = np.exp(log_gap)
+        density = np.exp(queue.log_prob(np.column_stack([np.tile(row[:3], (400, 1)), gaps]))) * gaps
+        mass = 0.5 * (np.log(150.0) - np.log(low)) * (density @ weights)
+        assert mass == pytest.approx(np.exp(others.log_prob(row[None, :3]))[0], rel=1e-6)
+    overlapping = [[16.0, 14.0, -8.0, 1.5]]
+    assert queue.log_prob(overlapping)[0] == -np.inf
+    with pytest.raises(ValueError, match=r"x\[0, 3\] = 1.5 is outside the range \[4.26316, 150\]"):
+        queue.to_standard_normal(overlapping)
+
+
+def test_a_pool_of_other_coordinates_keeps_what_cuts_their_ranges() -> None:
+    """A loss from the speed to 1 m/s above it, in plain and in log speeds: nobody loses other than that."""
+    box: dict[str, Any] = {"low": [1.0, 1.0], "high": [45.0, 50.0], "names": ("speed", "loss")}
+    parts = [
+        TruncatedGaussianMixture(
+            [1.0],
+            [[mean, 25.0]],
+            [np.diag([variance, 1e8])],
+            coordinates=Coordinates(**box, kinds=(kind, "plain"), within=(("loss", "speed", 0.0, 1.0),)),
+        )
+        for kind, mean, variance in (("plain", 14.0, 9.0), ("log", 2.6, 0.05))
+    ]
+    pool = pool_mixtures(parts)
+    assert isinstance(pool, PooledMixture)
+    x = pool.sample(4000, np.random.default_rng(0))
+    assert ((x[:, 1] >= x[:, 0]) & (x[:, 1] <= x[:, 0] + 1.0)).all()
+    mean = np.mean([np.exp(each.log_prob(x)) for each in parts], axis=0)
+    np.testing.assert_allclose(np.exp(pool.log_prob(x)), mean, rtol=1e-9)
+    u = pool.to_standard_normal(x)
+    assert np.abs(pool.from_standard_normal(u) - x).max() < 1e-9
+    assert min(stats.kstest(u[:, j], "norm").pvalue for j in range(2)) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("within", "message"),
+    [
+        (
+            ("cut_in_gap", "lead_gap", "ego_speed", "lead_speed", -4.0, 7.6),
+            "after lead_gap, ego_speed, lead_speed in order",
+        ),
+        (("lead_gap", "cut_in_gap", "ego_speed", "lead_speed", 50.0, 7.6), "within leaves lead_gap no range: from 193"),
+    ],
+)
+def test_room_that_cannot_be_is_refused(within: tuple[Any, ...], message: str) -> None:
+    own = make_queue(5, QUEUE_NAMES).coordinates
+    with pytest.raises(ValueError, match=message):
+        Coordinates(own.low, own.high, own.kinds, own.names, within=(within,))
+
+
 def test_bad_points_are_refused() -> None:
     with pytest.raises(ValueError, match=r"x of shape \(n, 3\), got \(3,\); add a batch axis"):
         FOLLOWING.log_prob([10.0, 10.0, 20.0])

@@ -7,16 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from scipy.stats import kstest
 
 import rare_envs
+from rare_envs.control.human_driver import MAX_HUMAN_BRAKING
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
+from rare_envs.traffic.bodies import overlaps
+from rare_envs.traffic.state import VEHICLE_LENGTH
 from tests.rare_envs.scenarios.standing import STANDING
 
 FOLLOWING = find_scenario("car_following")
@@ -42,6 +46,19 @@ def test_shipped_bases_fit_their_scenario(scenario: Scenario, base: str) -> None
         for width in (3.0, 8.0):  # as wide as draws of two-stage, and more: no weight is 0 for want of support
             far = space.from_standard_normal(width * rng().standard_normal((400, space.dim)))
             assert np.isfinite(space.log_prob(space.validate(far))).all()
+
+
+@pytest.mark.parametrize(("scenario", "base"), [(each, base) for each in SCENARIOS.values() for base in each.bases])
+def test_no_start_is_one_that_cannot_be_on_a_road(scenario: Scenario, base: str) -> None:
+    """No bodies overlap, nobody drives backwards, and before a cut-in an ego that brakes fully avoids its own lead."""
+    whole: Any = load_base(scenario, base)
+    for part in [each.base for each in getattr(whole, "strata", ())] or [whole]:
+        state = scenario.initial(torch.from_numpy(part.sample(20_000, rng())))
+        assert not overlaps(state, scenario.road, "all").any() and (state.speed >= 0.0).all()
+        if scenario.name == "cut_in":
+            gap, closing = state.x[:, 2] - state.x[:, 0] - VEHICLE_LENGTH, state.speed[:, 0] - state.speed[:, 2]
+            assert (gap >= 1.0 - 1e-9).all()
+            assert (closing.clamp_min(0.0).square() / (2.0 * gap) < MAX_HUMAN_BRAKING).all()
 
 
 def test_a_file_is_read_once_until_it_changes_and_knows_the_bases_of_its_own_scenario(tmp_path: Path) -> None:

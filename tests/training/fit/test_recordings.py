@@ -132,6 +132,8 @@ def test_bases_are_fitted_to_recordings(simulated, quick, tmp_path, capsys):
     own = load_base(find_scenario("cut_in"), files[1])
     assert [each.name for each in own.strata] == ["unseen", "looked"]
     assert own.record["motion"]["cutters"]["events"] > 10
+    for each in own.strata:  # nobody begins with the lead inside the ego
+        assert (each.base.sample(20_000, np.random.default_rng(0))[:, 3:5].sum(axis=1) + 5.0 >= 1.0 - 1e-9).all()
     printed = capsys.readouterr().err
     assert "cut_in, recorded / expected: looked: TTC < 2 s " in printed and "cut_in, followers: " in printed
     for scenario, file in zip(("car_following", "cut_in"), files, strict=False):
