@@ -155,8 +155,8 @@ class MappedMixture:
                 out[end - size : end] = array
         is_log = np.repeat([part.coordinates.is_log(j) for part in self.parts], sizes)[:, None]
         log_weights, mean, scale = joined
-        ends = self.coordinates.range_of(j, x)
-        return TruncatedConditional(log_weights, mean, scale, *ends, is_log if is_log.any() else None)
+        bounds = self.coordinates.range_of(j, x)
+        return TruncatedConditional(log_weights, mean, scale, *bounds, is_log if is_log.any() else None)
 
 
 class Walk:
