@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -125,7 +125,7 @@ class AcceptedGaps:
     @cached_property
     def high(self) -> FloatArray:
         """Upper bounds, shape (d,)."""
-        return self._with_range(self.mixture.high, self.mixture.coordinates.within[0].most)
+        return self._with_range(self.mixture.high, cast(Any, self.mixture.coordinates.within[0]).most)
 
     @property
     def log_share(self) -> float:
@@ -241,7 +241,7 @@ class AcceptedGaps:
 
     def _to_closing(self, x: FloatArray) -> FloatArray:
         """Return points with the closing speed; rounding of a difference does not lead out of its range."""
-        z, within = x.copy(), self.mixture.coordinates.within[0]
+        z, within = x.copy(), cast(Any, self.mixture.coordinates.within[0])
         closing = x[:, self._ego] - x[:, self._speed]
         inner = np.clip(closing, *(end[self._speed] for end in self.mixture.coordinates.ends))
         z[:, self._speed] = np.where(np.abs(closing - inner) < ROUNDING, inner, closing)
