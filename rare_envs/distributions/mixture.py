@@ -153,10 +153,9 @@ class MappedMixture:
             arrays = each.log_weights + row, shift + slope * each.mean, np.abs(slope) * each.scale
             for out, array in zip(joined, arrays, strict=True):
                 out[end - size : end] = array
-        is_log = np.repeat([part.coordinates.is_log(j) for part in self.parts], sizes)[:, None]
-        log_weights, mean, scale = joined
-        bounds = self.coordinates.range_of(j, x)
-        return TruncatedConditional(log_weights, mean, scale, *bounds, is_log if is_log.any() else None)
+        logs = np.repeat([part.coordinates.is_log(j) for part in self.parts], sizes)[:, None]
+        shares, mean, scale = joined
+        return TruncatedConditional(shares, mean, scale, *self.coordinates.range_of(j, x), logs if logs.any() else None)
 
 
 class Walk:
