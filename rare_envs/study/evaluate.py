@@ -38,7 +38,7 @@ from rare_envs.simulation.world import rollout
 from rare_envs.startup import __version__
 from rare_envs.study import arguments, writing
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
-from rare_envs.study.ego_check.checks import ACTION_ROUNDING
+from rare_envs.study.ego_check import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures, drive_by_others
 from rare_envs.study.question import (

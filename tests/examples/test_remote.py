@@ -13,8 +13,7 @@ import pytest
 import rare_envs
 from agents import load_ego
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check import Finding, exit_code
-from rare_envs.study.ego_check.subprocess_check import run_checks
+from rare_envs.study.ego_check import Finding, exit_code, run_checks
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 FOLDER = Path(__file__).parents[2] / "examples" / "remote"

@@ -183,8 +183,7 @@ def check_ego_command(
     show_all: Annotated[bool, Option("--all", help="Show the checks that passed too, one per row.")] = False,
 ) -> Answer:
     """Check in seconds whether a policy fits: spaces, normalisation, determinism, memory, speed. Exit code 2: no."""
-    from rare_envs.study.ego_check import VERDICTS, exit_code, print_findings
-    from rare_envs.study.ego_check.subprocess_check import check_ego
+    from rare_envs.study.ego_check import VERDICTS, check_ego, exit_code, print_findings
 
     findings = check_ego(Question(env_id=env, ego=ego, **asked), time_limit)
     code = exit_code(findings)

@@ -17,8 +17,7 @@ from typer.testing import Result
 import agents
 from agents.safe_pickle import find_origin_risks
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check import Finding, exit_code
-from rare_envs.study.ego_check.subprocess_check import check_ego, run_checks
+from rare_envs.study.ego_check import Finding, check_ego, exit_code, run_checks
 from tests.rare_envs.study.refusals import in_file
 
 Cli = Callable[..., Result]
@@ -253,7 +252,7 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
 def test_a_zip_of_ones_own_is_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("ego.zip").touch()
-    monkeypatch.setattr("rare_envs.study.ego_check.subprocess_check._check_in_subprocess", lambda *_: iter(()))
+    monkeypatch.setattr("rare_envs.study.ego_check._check_in_subprocess", lambda *_: iter(()))
     (origin,) = check_ego(Question(env_id=ENV, ego="ego.zip"))
     assert (origin.check, origin.status) == ("origin", "pass")
     (trusted,) = check_ego(Question(env_id=ENV, ego="ego.zip", trust=True))

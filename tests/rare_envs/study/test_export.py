@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
-from rare_envs.study.export import export_drive, export_scenario, find_trajectories
+from rare_envs.study.export import export_drive, export_scenario, find_moments
 from rare_envs.study.replay import Drive, drive_again
 
 
@@ -219,7 +219,7 @@ def test_a_missing_library_is_named(cut_in: Drive, tmp_path: Path, monkeypatch: 
 
 
 def test_a_crash_at_the_start_stands_for_one_tick(cut_in: Drive) -> None:
-    found = find_trajectories(Drive(cut_in.problem, cut_in.episodes[:1]))
+    found = find_moments(Drive(cut_in.problem, cut_in.episodes[:1]))
     assert found.time.tolist() == [0.0, 0.1] and np.array_equal(found.x[0], found.x[1])
 
 
