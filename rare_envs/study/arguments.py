@@ -137,10 +137,16 @@ def refuse_existing(force: bool, *paths: Path | None) -> None:
 
 @contextlib.contextmanager
 def output_file(path: Path | None, force: bool = True) -> Iterator[None]:
-    """Make the folder of a file before the work, as `output_folder` does; None where there is none to write."""
+    """Make the folder of a file before the work, as `output_folder` does, and say of an error which file it is.
+
+    None where there is none to write.
+    """
     refuse_existing(force, path)
     with contextlib.nullcontext() if path is None else output_folder(path.parent, path.name):
-        yield
+        try:
+            yield
+        except OSError as error:
+            raise BadInput(f"Cannot write {str(path)!r}: {error.strerror or error}.") from error
 
 
 EXECUTORS = ("local", "ray")

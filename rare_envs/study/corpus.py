@@ -164,10 +164,9 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
     study = load_finished(run)
-    failures, modes = list_failures(study, trust), study.result.get("modes")
+    failures = list_failures(study, trust)
     first = {failure.crash: number for number, failure in reversed(list(enumerate(failures)))}
-    named = [mode.get("failure") for mode in modes if isinstance(mode, dict)] if isinstance(modes, list) else []
-    of_modes = [number for number in named if type(number) is int and 0 <= number < len(failures)]
+    of_modes = [number for number in study.modes if number is not None and 0 <= number < len(failures)]
     order = list(dict.fromkeys([*sorted(first.values()), *of_modes, *range(len(failures))]))
     chosen = [failures[number] for number in sorted(order[:most])]
     if not chosen:

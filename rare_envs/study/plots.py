@@ -30,7 +30,7 @@ from rare_envs.measures import MEASURES
 from rare_envs.people import HumanBenchmark
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.study import run_folder
-from rare_envs.study.arguments import BadInput, as_bad_input, output_file
+from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
 from rare_envs.study.events import EventRate
 from rare_envs.study.replay import Drive, describe_contact, drive_again
@@ -465,7 +465,7 @@ def write_film(path: Path | str, drive: Drive, width: int = rendering.FRAME_WIDT
     frames = draw_frames(drive)
     size = (width, round(frames[0].height * width / rendering.FRAME_WIDTH))
     shown = [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames]
-    with output_file(path), as_bad_input(OSError), replace_file(path) as draft:
+    with output_file(path), replace_file(path) as draft:
         if path.suffix.lower() == ".png":
             shown[drive.worst].save(draft)
             return

@@ -175,6 +175,13 @@ class LoadedStudy:
         return read_failures(self.folder)
 
     @property
+    def modes(self) -> list[int | None]:
+        """Numbers of the most likely failure of each kind of crash, the most frequent first; None if none is listed."""
+        found = self.result.get("modes")
+        numbers = [each.get("failure") for each in found if isinstance(each, dict)] if isinstance(found, list) else []
+        return [number if type(number) is int else None for number in numbers]
+
+    @property
     def changed_files(self) -> list[str]:
         """Names of files that are not what the run wrote: damaged, edited, removed, or of another run."""
         written = self.about.get("results")

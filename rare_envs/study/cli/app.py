@@ -16,7 +16,8 @@ from typer import Argument, Option
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import as_bad_input
 from rare_envs.study.cli import egos_and_runs, estimate
-from rare_envs.study.cli.shell import Answer, OneLineErrors, PanelCommand, SummarisedCommands, command, end_soon
+from rare_envs.study.cli.options import PanelCommand, command
+from rare_envs.study.cli.shell import Answer, OneLineErrors, end_soon
 
 EXAMPLES = """
 rare-envs list
@@ -122,18 +123,17 @@ COMMANDS = (
     *("corpus add", "corpus run"),
 )
 """Commands in the order of the first page; the function of `corpus add` is `corpus_add_command`."""
-corpus_app = typer.Typer(
-    cls=SummarisedCommands,
-    help="Keep failures as regression scenarios, and test other egos in them.",
-    epilog=format_examples("corpus"),
-)
+CORPUS = "Keep failures as regression scenarios, and test other egos in them."
+corpus_app = typer.Typer(help=CORPUS, short_help=CORPUS, epilog=format_examples("corpus"))
 app.add_typer(corpus_app, name="corpus")
 app.info.epilog = format_examples("")
 _functions = {**vars(estimate), **vars(egos_and_runs), **globals()}
 for _name in COMMANDS:
     _group, _, _word = _name.rpartition(" ")
     _function = _functions[f"{_name.replace(' ', '_').replace('-', '_')}_command"]
-    (corpus_app if _group else app).command(_word, cls=PanelCommand, epilog=format_examples(_name))(_function)
+    _summary = f"{(_function.__doc__ or '').partition('. ')[0].rstrip('.')}."  # whole, where Typer would cut it
+    _register = (corpus_app if _group else app).command
+    _register(_word, cls=PanelCommand, short_help=_summary, epilog=format_examples(_name))(_function)
 
 
 def main() -> None:

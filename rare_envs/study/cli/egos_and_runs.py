@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder, refuse_existing
-from rare_envs.study.cli import shell
-from rare_envs.study.cli.shell import DOUBTFUL, EGO_FILE, Answer, ForceOption, RunArgument, command
+from rare_envs.study.cli import options
+from rare_envs.study.cli.options import EGO_FILE, ForceOption, RunArgument, command
+from rare_envs.study.cli.shell import DOUBTFUL, NOISE, Answer
 from training.command_line import EventOptions, spread_options
 
 if TYPE_CHECKING:
-    from rare_envs.study.corpus import RetrainingPlan, Trial
+    from rare_envs.study.corpus import Trial
 
 FAILS = 4
 """Exit code if the ego fails in a stored scenario, as if p is above a limit."""
@@ -34,7 +35,7 @@ USUAL = {"noise": "on", "observation": "features", "action": "continuous"}
 """Options of `estimate` that need not be typed for an ego that is trained here."""
 
 
-@command(*shell.SCENARIO, "seed", "trust", more=("horizon", "noise", "weather"))
+@command(*options.SCENARIO, "seed", "trust", more=("horizon", "noise", "weather"))
 def train_ego_command(
     asked: dict[str, Any],
     envs: Annotated[
@@ -46,13 +47,13 @@ def train_ego_command(
     ] = None,
     algo: Annotated[str | None, Option(help="Algorithm of Stable-Baselines3.", show_default="ppo")] = None,
     steps: Annotated[
-        int, Option(help="Environment steps to train for.", parser=shell.read_count, metavar="INTEGER")
+        int, Option(help="Environment steps to train for.", parser=options.read_count, metavar="INTEGER")
     ] = 200_000,
     out: Annotated[Path, Option(help="File to save the policy in.")] = Path("ego.zip"),
     num_envs: Annotated[int, Option(help="Number of parallel episodes.")] = 256,
     device: Annotated[str, Option(help="Device that simulates and trains: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
     resume: Annotated[bool, Option("--resume", help="Continue an interrupted training.")] = False,
-    force: shell.ForceOption = False,
+    force: ForceOption = False,
     from_failures: Annotated[
         list[Path] | None,
         Option(
@@ -76,51 +77,56 @@ def train_ego_command(
     from training.ego_training import HYPERPARAMETERS
 
     seed, trust = asked.pop("seed"), asked.pop("trust")
-    ids, plan = _read_environments(envs or []), None
+    ids, more = _read_environments(envs or []), dict[str, Any]()
+    data: dict[str, Any] = {}
+    next_seed = None
     if from_failures:
-        plan = _read_plan(from_failures, failure_share, trust, ids, algo, asked)
-        ids, algo, world = (plan.env_id,), plan.algo, dict(plan.world)
+        from rare_envs.study.corpus import plan_retraining
+
+        if any(value != getattr(Question, name) for name, value in asked.items()):
+            raise BadInput("The world of --from-failures is that of the run: leave --base, --drivers and the like out.")
+        plan = plan_retraining(from_failures, failure_share, trust)
+        for name, given, own in (("SCENARIO", " ".join(ids), plan.env_id), ("--algo", algo, plan.algo)):
+            if given not in ("", None, own):
+                run = repr(str(from_failures[-1]))
+                raise BadInput(f"Expected {name} {own}, that of the run in {run}, got {given!r}; leave it out.")
+        ids, algo, world, next_seed = (plan.env_id,), plan.algo, dict(plan.world), plan.next_seed
+        more["retraining"] = retraining = plan.retraining
+        data = {"retrained": str(retraining.ego), "failures": len(retraining.failures)}
+        data["failure_share"] = retraining.share
     elif not ids:
         raise BadInput("Expected a scenario, such as CutIn, or --from-failures RUN; rare-envs list has all.")
     else:
         algo = algo or "ppo"
         world = {**asked, **{name: asked[name] or USUAL[name] for name in ("observation", "action")}}
-    retraining = None if plan is None else plan.retraining
-    settings: dict[str, Any] = {**world, "retraining": retraining, **({} if device == "cpu" else {"device": device})}
-    settings["even_strata"] = even_strata
+    more |= {} if device == "cpu" else {"device": device}
+    more |= {"trust": True} if trust else {}
+    settings: dict[str, Any] = {
+        "seed": seed,
+        "num_envs": num_envs,
+        "resume": resume,
+        "force": force,
+        "even_strata": even_strata,
+    }
     with as_bad_input(ValueError, OSError):
-        path = train_ego(
-            ids, algo, steps, out=out, seed=seed, num_envs=num_envs, resume=resume, force=force, **settings
-        )
-    data = {"ego": str(path), "env_id": ids[0] if len(ids) == 1 else ids, "algo": algo, "steps": steps, "seed": seed}
-    data |= {**world, "even_strata": even_strata}
-    if retraining is not None:
-        data |= {"retrained": str(retraining.ego), "failures": len(retraining.failures)}
-        data["failure_share"] = retraining.share
+        path = train_ego(ids, algo, steps, out=out, **settings, **more, **world)
+    of_run = {"ego": str(path), "env_id": ids[0] if len(ids) == 1 else ids, "algo": algo, "steps": steps, "seed": seed}
+    data = {**of_run, **world, "even_strata": even_strata, **data}
     if HYPERPARAMETERS[algo].discrete and asked["action"] is None:
         world["action"] = "discrete"  # which is what the algorithm made of it
-    next_seed = None if plan is None else plan.next_seed
-    return Answer(
-        data,
-        f"Saved {path}. Next: rare-envs {shlex.join(_list_next_words(ids, str(path), world, next_seed))}"
-        f"{_list_further_settings(world)}",
-    )
+    return Answer(data, f"Saved {path}. Next: {_advise_next(ids, str(path), world, next_seed)}")
 
 
-def _list_next_words(ids: Sequence[str], ego: str, world: Mapping[str, Any], seed: int | None) -> list[str]:
-    """Return the words of the command that comes next: the estimate, or the risk of several scenarios."""
-    options = {name: world[name] for name in shell.SCENARIO if world[name] not in (None, USUAL.get(name))}
-    words = ["estimate", *ids, "--ego", ego] if len(ids) == 1 else ["risk", ego]
-    words += [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    return words if seed is None or len(ids) > 1 else [*words, "--seed", str(seed)]
-
-
-def _list_further_settings(world: Mapping[str, Any]) -> str:
-    """Return what the file of --config has to say beside these words; empty if nothing."""
-    noise = next(word for word, argument in shell.NOISE.items() if argument == world["noise"])
+def _advise_next(ids: Sequence[str], ego: str, world: Mapping[str, Any], seed: int | None) -> str:
+    """Return the command that comes next, the estimate or the risk of several scenarios, and what its file says."""
+    words = ["rare-envs", "estimate", *ids, "--ego", ego] if len(ids) == 1 else ["rare-envs", "risk", ego]
+    named = [name for name in options.SCENARIO if world[name] not in (None, USUAL.get(name))]
+    words += [word for name in named for word in (f"--{name}", str(world[name]))]
+    words += ["--seed", str(seed)] if seed is not None and len(ids) == 1 else []
+    noise = next(word for word, argument in NOISE.items() if argument == world["noise"])
     values = {"horizon": world["horizon"], "noise": noise, "weather": "true" if world["weather"] else None}
     lines = [f"{name}: {value}" for name, value in values.items() if value not in (None, USUAL.get(name))]
-    return f" --config FILE, with {', '.join(lines)} in the file" if lines else ""
+    return shlex.join(words) + (f" --config FILE, with {', '.join(lines)} in the file" if lines else "")
 
 
 def _read_environments(names: Sequence[str]) -> tuple[str, ...]:
@@ -129,21 +135,6 @@ def _read_environments(names: Sequence[str]) -> tuple[str, ...]:
     from rare_envs.study.risk import SCENARIO_SET
 
     return tuple(map(env_id_of, SCENARIO_SET)) if [*names] == ["all"] else tuple(map(complete_id, names))
-
-
-def _read_plan(
-    runs: list[Path], share: float, trust: bool, ids: Sequence[str], algo: str | None, asked: Mapping[str, Any]
-) -> RetrainingPlan:
-    """Return how to train on with the failures of runs."""
-    from rare_envs.study.corpus import plan_retraining
-
-    if any(value != getattr(Question, name) for name, value in asked.items()):
-        raise BadInput("The world of --from-failures is that of the run: leave --base, --drivers and the like out.")
-    plan = plan_retraining(runs, share, trust)
-    for name, given, own in (("ENV", " ".join(ids), plan.env_id), ("--algo", algo, plan.algo)):
-        if given not in ("", None, own):
-            raise BadInput(f"Expected {name} {own}, that of the run in {str(runs[-1])!r}, got {given!r}; leave it out.")
-    return plan
 
 
 @spread_options
@@ -161,12 +152,12 @@ def fit_command(
         int | None, Option(help="Number of bootstrap refits; by default 30, or 100 if their components differ.", min=2)
     ] = None,
     seed: Annotated[int, Option(help="Random seed of the fits.", min=0)] = 0,
-    force: shell.ForceOption = False,
+    force: ForceOption = False,
 ) -> Answer:
     """Fit traffic models to recorded traffic, with bootstrap refits for their uncertainty."""
     from training.fit.recordings import fit_bases
 
-    scenarios = shell.split_words(*scenario or ()) or None
+    scenarios = options.split_words(scenario) or None
     settings: dict[str, Any] = {"scenarios": scenarios, "name": name, "n_refits": refits, "seed": seed, "force": force}
     with output_folder(out), as_bad_input(ValueError, OSError):
         files = fit_bases(recordings, out, cut_gaps=cut_gaps, progress=True, **settings)
@@ -174,10 +165,10 @@ def fit_command(
     return Answer({"bases": [str(path) for path in files]}, "\n".join(lines))
 
 
-@command(*shell.SCENARIO, *EGO_FILE, "trust")
+@command(*options.SCENARIO, *EGO_FILE, "trust")
 def check_ego_command(
-    ego: shell.EgoArgument,
-    env: shell.EnvArgument,
+    ego: options.EgoArgument,
+    env: options.EnvArgument,
     asked: dict[str, Any],
     time_limit: Annotated[float, Option(help="Time limit of each check in seconds.")] = 30.0,
     show_all: Annotated[bool, Option("--all", help="Show the checks that passed too, one per row.")] = False,
@@ -257,8 +248,7 @@ def corpus_run_command(
     with output_file(junit, force or _is_junit(junit)):
         trials, seconds = try_ego(read_corpus(corpus), corpus, ego, **asked)
         if junit is not None:
-            with _unwritten(junit):
-                write_junit(junit, trials, ego, seconds)
+            write_junit(junit, trials, ego, seconds)
     return _describe_tries(trials, seconds, ego)
 
 
@@ -302,8 +292,8 @@ def _describe_tries(trials: Sequence[Trial], seconds: float, ego: str) -> Answer
 
 def _count(trials: Sequence[Trial], seconds: float) -> dict[str, Any]:
     """Return trials and their outcomes, JSON-ready."""
-    outcomes = [trial.outcome for trial in trials]
-    counts = {outcome: outcomes.count(outcome) for outcome in ("passed", "failed", "error")}
+    outcomes = Counter(trial.outcome for trial in trials)
+    counts = {outcome: outcomes[outcome] for outcome in ("passed", "failed", "error")}
     return {**counts, "seconds": seconds, "trials": [trial.to_dict() for trial in trials]}
 
 
@@ -316,23 +306,19 @@ def _list(trials: Sequence[Trial]) -> list[str]:
 
 def _choose_failure(run: Path, failure: int, mode: int | None, typed: set[str]) -> int:
     """Return the number of the failure that --failure or --mode means."""
-    from rare_envs.study.run_folder import load_finished
-
     if mode is None:
         return failure
     if "failure" in typed:
         raise BadInput("Expected --failure or --mode, not both.")
-    found = load_finished(run).result.get("modes")
-    modes = [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
-    if not 1 <= mode <= len(modes):
-        kinds = f"{len(modes)} kinds" if len(modes) != 1 else "1 kind"
-        raise BadInput(
-            f"Expected --mode from 1 to {len(modes)}, got {mode}: the run has {kinds} of crash."
-            if modes
-            else "The run has no kinds of crash: give --failure."
-        )
-    number = modes[mode - 1].get("failure")
-    if type(number) is not int:
+    from rare_envs.study.run_folder import load_finished
+
+    numbers = load_finished(run).modes
+    if not numbers:
+        raise BadInput("The run has no kinds of crash: give --failure.")
+    if mode > len(numbers):
+        kinds = f"{len(numbers)} kinds" if len(numbers) != 1 else "1 kind"
+        raise BadInput(f"Expected --mode from 1 to {len(numbers)}, got {mode}: the run has {kinds} of crash.")
+    if (number := numbers[mode - 1]) is None:
         raise BadInput(f"The run lists no failure of the crash kind {mode}: give --failure.")
     return number
 
@@ -370,19 +356,9 @@ def replay_command(
         if out is not None:
             write_film(out, drive)
     same = abs(drive.f - recorded.f) <= REPLAY_TOLERANCE
-    data = {
-        "failure": failure,
-        "failures": recorded.n_listed,
-        "n_failures": recorded.n_found,
-        "f": drive.f,
-        "f_recorded": recorded.f,
-        "same": same,
-        "log_p0": recorded.log_p0,
-        "seconds": float(drive.time[-1]),
-        "crash": drive.crash,
-        "out": None if out is None else str(out),
-        "ego": ego,
-    }
+    data: dict[str, Any] = {"failure": failure, "failures": recorded.n_listed, "n_failures": recorded.n_found}
+    data |= {"f": drive.f, "f_recorded": recorded.f, "same": same, "log_p0": recorded.log_p0}
+    data |= {"seconds": float(drive.time[-1]), "crash": drive.crash, "out": out and str(out), "ego": ego}
     lines = [*describe_drive(recorded, drive, failure, ego), *([] if out is None else [f"Wrote {out}."])]
     return Answer(data, "\n".join(lines), 0 if same or ego is not None else DOUBTFUL)
 
@@ -419,31 +395,25 @@ def export_command(
     file = target or out
     assert file is not None
     run, of_run = Path(source), {"failure", "mode", "format", "ego"}
-    if wrong := sorted(typed & (set(EGO_FILE) if run.is_dir() else of_run)):
+    is_run = run.is_dir()
+    if wrong := sorted(typed & (set(EGO_FILE) if is_run else of_run)):
         raise BadInput(
-            f"Expected --{wrong[0]} with {'a policy file' if run.is_dir() else 'the folder of a run'}, got {source!r}."
+            f"Expected --{wrong[0]} with {'a policy file' if is_run else 'the folder of a run'}, got {source!r}."
         )
-    if not run.is_dir() and (run.suffix == ".zip" or file.suffix == ".onnx"):
+    if not is_run and (run.suffix == ".zip" or file.suffix == ".onnx"):
         return _export_ego(run, file, force, asked)
-    return _export_failure(run, file, format, ego, force, asked["trust"], _choose_failure(run, failure, mode, typed))
-
-
-def _export_failure(
-    run: Path, out: Path, format: str, ego: str | None, force: bool, trust: bool, failure: int
-) -> Answer:
-    """Write a failure as OpenSCENARIO and OpenDRIVE, for CARLA's scenario_runner, or as CommonRoad XML."""
     from rare_envs.study.export import check_export, export_scenario
     from rare_envs.study.replay import find_failure
 
+    number = _choose_failure(run, failure, mode, typed)
     with as_bad_input(ValueError):
-        check_export(out, format, ego)
-        refuse_existing(force or format == "commonroad", out.with_suffix(".xodr"))
-        with output_file(out, force):
-            recorded = find_failure(run, failure, trust)
-            with _unwritten(out):
-                files = export_scenario(recorded.problem, recorded.x, out, format, ego)  # type: ignore[arg-type]
+        check_export(file, format, ego)
+        refuse_existing(force or format == "commonroad", file.with_suffix(".xodr"))
+        with output_file(file, force):
+            recorded = find_failure(run, number, asked["trust"])
+            files = export_scenario(recorded.problem, recorded.x, file, format, ego)  # type: ignore[arg-type]
     names = [str(path) for path in files]
-    data = {"failure": failure, "failures": recorded.n_listed, "format": format, "files": names}
+    data = {"failure": number, "failures": recorded.n_listed, "format": format, "files": names}
     return Answer(data, f"Wrote {' and '.join(names)}.")
 
 
@@ -461,23 +431,13 @@ def _export_ego(model: Path, out: Path, force: bool, asked: Mapping[str, Any]) -
 
         ego = load_saved_ego(model, asked["algo"], asked["trust"], asked["stats"])
         difference, tried = export_onnx(ego, out)
-    data = {
+    statistics = ego.statistics_path and str(ego.statistics_path)
+    data: dict[str, Any] = {
         "model": str(model),
         "algorithm": ego.algorithm,
-        "vec_normalize": None if ego.statistics_path is None else str(ego.statistics_path),
+        "vec_normalize": statistics,
         "onnx": str(out),
-        "largest_difference": difference,
-        "tolerance": ACTION_TOLERANCE,
-        "observations_tried": tried,
     }
+    data |= {"largest_difference": difference, "tolerance": ACTION_TOLERANCE, "observations_tried": tried}
     found = f"its actions differ by {difference:.1e} at most on {tried:,} random observations"
     return Answer(data, f"Wrote {out}: {found}.")
-
-
-@contextlib.contextmanager
-def _unwritten(path: Path) -> Iterator[None]:
-    """Say which file cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        raise BadInput(f"Cannot write {str(path)!r}: {error.strerror or error}.") from error

@@ -11,24 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
-from rare_envs.scenarios.registry import find_scenario, is_highway_env_id
-from rare_envs.study.arguments import (
-    GATE_CODES,
-    BadInput,
-    ExecutorOptions,
-    Question,
-    as_bad_input,
-    find_method,
-    read_mapping,
-)
-from rare_envs.study.cli import shell
-from rare_envs.study.cli.shell import DOUBTFUL, Answer, command, describe_report
+from rare_envs.scenarios.registry import complete_id, find_scenario, is_highway_env_id
+from rare_envs.study.arguments import BadInput, Question, as_bad_input, find_method, read_mapping
+from rare_envs.study.cli import options
+from rare_envs.study.cli.options import command
+from rare_envs.study.cli.shell import DOUBTFUL, EXECUTOR, Answer, tell
 
 if TYPE_CHECKING:
-    from rare_envs.study.risk import Risk, RiskComparison
     from samplers import Estimate
-    from samplers.comparison import Comparison
-    from samplers.executors import Executor
 
 NOTHING_MADE = "Stopped: no estimate yet, no simulation made."
 """What is known of a run that was interrupted before it has begun."""
@@ -43,12 +33,6 @@ UNPLANNED = frozenset({"out", "force", "details", "max_p", "max_rate", "assume_t
 """Options that a plan by pilots does not use."""
 PAIR_SIMULATIONS = 12_000
 """Simulations of both egos of a comparison together."""
-REPORTED = ("also_under", "sensitivity")
-"""Fields that add to the answer of an estimate."""
-PLANNED = frozenset({"env", "config", "plan", "target_cov", "as_json"})
-"""Options of a plan from the folder of a run, in which nothing is simulated."""
-UNPLANNED = frozenset({"out", "force", "details", "max_p", "max_rate", "assume_traffic", "workers", "env_config"})
-"""Options that a plan by pilots does not use."""
 ESTIMATE_FILE = "estimate.safetensors"
 """File in the folder of `--out`; `samplers.Estimate.load` reads it."""
 HELD = "HighwayEnv's environment as it is: what it holds fixed is held; rare_envs.highway_env_problem varies it too"
@@ -56,15 +40,19 @@ HELD = "HighwayEnv's environment as it is: what it holds fixed is held; rare_env
 
 
 @command(
-    *("ego", *shell.SCENARIO, "measure", "gamma", "method", "max_sim", "target_cov", "confidence", "seed"),
+    *("ego", *options.SCENARIO, "measure", "gamma", "method", "max_sim", "target_cov", "confidence", "seed"),
     *("max_p", "max_rate", "assume_traffic", "workers", "trust"),
-    more=("env_id", *shell.WORLD_IN_FILES, *shell.RUN_IN_FILES, "replicates", "on_error", "ensemble", *REPORTED),
+    more=(
+        *("env_id", *options.WORLD_IN_FILES, *options.RUN_IN_FILES),
+        *("replicates", "on_error", "ensemble", "also_under", "sensitivity"),
+    ),
     texts=("env_config",),
     stopped=NOTHING_MADE,
 )
 def estimate_command(
     asked: dict[str, Any],
     typed: set[str],
+    executor: Any,
     env: Annotated[
         str | None,
         Argument(
@@ -78,18 +66,17 @@ def estimate_command(
     ] = False,
     env_config: str | None = None,
     out: Annotated[Path | None, Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
-    force: shell.ForceOption = False,
-    details: shell.DetailsOption = False,
+    force: options.ForceOption = False,
+    details: options.DetailsOption = False,
 ) -> Answer:
     """Estimate how often an ego fails in a scenario, with an interval, and show its most likely failure."""
-    env = env or asked.pop("env_id")
     if env is None:
         raise BadInput("Expected a scenario: rare-envs estimate CutIn, or env: CutIn in the file of --config.")
     if plan:
         return _plan(env, asked, typed)
     if Path(env).is_dir():
         raise BadInput(f"{env!r} is a folder: rare-envs resume {env}, rare-envs report {env}, or --plan with it.")
-    question, executor = _ask(env, asked)
+    question = _ask(env, asked)
     if is_highway_env_id(question.env_id):
         refused = sorted(typed - OPTIONS)
         if refused:
@@ -108,25 +95,18 @@ def estimate_command(
     from rare_envs.study.question import prepare
 
     estimate = run if out is None else partial(run_into, out, force=force)
-    return describe_report(estimate(prepare(question), progress=True, executor=executor), out, details)
+    return tell(estimate(prepare(question), progress=True, executor=executor), out, details)
 
 
-def _ask(env: str, asked: Mapping[str, Any], **more: Any) -> tuple[Question, Executor | None]:
-    """Return the question in a scenario, and the executor, that options ask for."""
-    of_question = {name: value for name, value in asked.items() if name not in (*shell.EXECUTOR, "env_id")}
-    of_question |= {**more, "env_id": shell.read_environment(env)}
-    if of_question.get("base") and not is_highway_env_id(env):
-        of_question["base"] = _read_bases([of_question["base"]], [env]).get(env)
+def _ask(env: str, asked: Mapping[str, Any]) -> Question:
+    """Return the question in a scenario that options ask for."""
+    base = asked.get("base")
+    if base and not is_highway_env_id(env):
+        base = _read_bases([base], [env]).get(env)
     with as_bad_input(ValueError):
-        question = Question(**of_question)
+        question = Question(**{**asked, "base": base, "env_id": complete_id(env)})
         _ = question.run_arguments
-        return question, _make_executor(asked)
-
-
-def _make_executor(asked: Mapping[str, Any]) -> Executor | None:
-    """Return the executor that options ask for."""
-    with as_bad_input(ValueError):
-        return ExecutorOptions(**{name: asked[name] for name in shell.EXECUTOR}).make()
+    return question
 
 
 def _read_bases(words: Sequence[str], scenarios: Sequence[str]) -> dict[str, str]:
@@ -148,21 +128,13 @@ def _read_bases(words: Sequence[str], scenarios: Sequence[str]) -> dict[str, str
     return found
 
 
-def format_seconds(seconds: float) -> str:
-    """Return a time in a unit of its size."""
-    if seconds < 7200.0:
-        size, unit = (1.0, "s") if seconds < 120.0 else (60.0, "min")
-        return f"{max(1, math.ceil(seconds / size))} {unit}"
-    return f"{seconds / 3600:,.0f} h"
-
-
 def estimate_highway_env(
     question: Question,
     config: dict[str, Any] | None,
     out: Path | None,
     force: bool,
     details: bool,
-    executor: Executor | None,
+    executor: Any,
 ) -> Answer:
     """Estimate how often an ego crashes in one of HighwayEnv's environments, as that environment draws its traffic."""
     import agents
@@ -177,23 +149,20 @@ def estimate_highway_env(
     file = None if out is None else out / ESTIMATE_FILE
     if file is not None and file.exists() and not force:
         raise BadInput(f"There is a finished run in {str(out)!r} ({ESTIMATE_FILE}): replace it by --force.")
-    names = ("gamma", "seed", "max_sim", "target_cov", "replicates", "on_error", "confidence")
     with as_bad_input(ValueError, OSError, TypeError):
-        method = find_method(question.method)
-        arguments = {name: getattr(question.run_arguments, name) for name in names}
+        method, arguments = find_method(question.method), asdict(question.run_arguments)
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         settings: dict[str, Any] = {"config": config}
         settings |= {} if question.horizon is None else {"horizon": question.horizon}
         problem = rare_envs.highway_env_problem(
             question.env_id, ego, measure=question.measure, noise=question.noise, fixed="highway_env", **settings
         )
-    with writing.journals_of(
-        {"command": "estimate", "env_config": config}, out, {"": question}, force, ESTIMATE_FILE
-    ) as (journal,):
+    whole = {"command": "estimate", "env_config": config}
+    with writing.journals_of(whole, out, {"": question}, force, ESTIMATE_FILE) as (journal,):
         with as_bad_input(ValueError, OSError, TypeError):
-            arguments["journal"] = journal
+            arguments |= {"journal": journal, "executor": executor, "progress": True}
             try:
-                result = samplers.estimate(problem, method, progress=True, executor=executor, **arguments)
+                result = samplers.estimate(problem, method, **arguments)
             except samplers.EstimationInterrupted as stopped:
                 known = _describe(question, problem, stopped.estimate, None, details)
                 raise RunInterrupted(describe_stop(stopped.estimate), known) from None
@@ -213,10 +182,10 @@ def _describe(question: Question, problem: Any, result: Estimate, out: Path | No
     from samplers.output import MOST_LINES, fold_rows
     from samplers.result import list_facts, list_warnings
 
-    shown = result
+    shown, likeliest = result, dict[str, Any]()
     if has_exact_bound(result):  # the warning that nothing failed casts no doubt on the upper end
         shown = replace(result, warnings=(), remarks=(*result.warnings, *result.remarks))
-    facts, likeliest = [*list_facts(result), ("Given", HELD)], {}
+    facts = [*list_facts(result), ("Given", HELD)]
     if len(result.failures):
         named = problem.space.named(result.failures.x[0].round(3))
         likeliest = {name: np.asarray(value).tolist() for name, value in named.items()}
@@ -224,10 +193,9 @@ def _describe(question: Question, problem: Any, result: Estimate, out: Path | No
     facts += [*list_warnings(shown.warnings), *([("Wrote", str(out))] if out else [])]
     lines = [f"{question.ego} in {question.env_id}", *fold_rows(facts, MOST_LINES - 1)]
     lines += shown.details().splitlines() if details else []
-    about = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
-    about["env_config"] = problem.config
-    data = {**result.to_dict(), **about, "doubtful": bool(shown.warnings)}
-    return Answer(data, "\n".join(lines), DOUBTFUL if shown.warnings else 0)
+    about: dict[str, Any] = {"env_id": question.env_id, "ego": question.ego, "given": HELD, "most_likely": likeliest}
+    about |= {"env_config": problem.config, "doubtful": bool(shown.warnings)}
+    return Answer({**result.to_dict(), **about}, "\n".join(lines), DOUBTFUL if shown.warnings else 0)
 
 
 def _plan(target: str, asked: dict[str, Any], typed: set[str]) -> Answer:
@@ -251,27 +219,35 @@ def _plan(target: str, asked: dict[str, Any], typed: set[str]) -> Answer:
             find_scenario(target)
         except ValueError as error:
             raise BadInput(f"There is no folder {target!r} of a run. {error}") from error
-        methods = shell.split_words(asked.pop("method"))
-        question, _ = _ask(target, {**asked, "target_cov": None})
-        found = plan_by_pilots(question, methods, cov, progress=True)
+        methods = options.split_words([asked.pop("method")])
+        found = plan_by_pilots(_ask(target, {**asked, "target_cov": None}), methods, cov, progress=True)
     lines = [f"For a relative error of {100 * cov:g} % (--target-cov {cov:g}):"]
     for each in found:
-        time = "" if each.seconds is None else f", about {format_seconds(each.seconds)} at the pilot's speed"
+        time = "" if each.seconds is None else f", about {_format_seconds(each.seconds)} at the pilot's speed"
         lines.append(f"  {each.method:<12} {each.n_sim:>15,} simulations{time}")
     return Answer({"target_cov": cov, "runs": [each.to_dict() for each in found]}, "\n".join(lines))
+
+
+def _format_seconds(seconds: float) -> str:
+    """Return a time in a unit of its size."""
+    if seconds < 7200.0:
+        size, unit = (1.0, "s") if seconds < 120.0 else (60.0, "min")
+        return f"{max(1, math.ceil(seconds / size))} {unit}"
+    return f"{seconds / 3600:,.0f} h"
 
 
 @command(
     *("drivers", "observation", "action", "method", "max_sim", "target_cov", "confidence", "seed"),
     *("max_rate", "assume_traffic", "workers", "trust"),
-    more=(*shell.WORLD_IN_FILES, *shell.RUN_IN_FILES, "replicates", "on_error"),
+    more=(*options.WORLD_IN_FILES, *options.RUN_IN_FILES, "replicates", "on_error"),
     texts=("scenario", "sites", "base"),
     stopped=NOTHING_MADE,
     max_sim={"help": "Largest number of simulations of each scenario."},
 )
 def risk_command(
-    ego: shell.EgoArgument,
+    ego: options.EgoArgument,
     asked: dict[str, Any],
+    executor: Any,
     scenario: Annotated[
         list[str] | None,
         Option(help="Scenarios of the sum, joined by commas: CutIn,HardBrake.", show_default="CutIn,HardBrake"),
@@ -284,38 +260,25 @@ def risk_command(
         str, Option(help="Sites of the traffic models, joined by commas; several add the spread between them.")
     ] = "us101",
     out: Annotated[Path | None, Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
-    force: shell.ForceOption = False,
-    details: shell.DetailsOption = False,
+    force: options.ForceOption = False,
+    details: options.DetailsOption = False,
 ) -> Answer:
     """Estimate collisions per million km, summed over scenarios, with an interval."""
-    from rare_envs.study.risk import SCENARIO_SET, Risk, risk
+    from rare_envs.study.risk import SCENARIO_SET, risk
 
-    executor, tell = _make_executor(asked), partial(_tell_risk, details)
-    scenarios = shell.split_words(*scenario or ()) or [*SCENARIO_SET]
-    options = {name: value for name, value in asked.items() if name not in shell.EXECUTOR}
+    scenarios = options.split_words(scenario) or [*SCENARIO_SET]
     bases = _read_bases(base or (), scenarios)
-    with as_bad_input(ValueError), shell.telling_unwritten(Risk, tell):
-        _ = Question(env_id=scenarios[0], **options).run_arguments
-        about: dict[str, Any] = {"scenarios": scenarios, "sites": shell.split_words(sites), "bases": bases, **options}
-        found = risk(ego, out=out, progress=True, force=force, executor=executor, **about)
-    return tell(found, out)
-
-
-def _tell_risk(details: bool, found: Risk | RiskComparison, out: Path | None = None) -> Answer:
-    """Return the answer of a risk, or of the comparison of two."""
-    from rare_envs.study.text import list_gate
-
-    code = DOUBTFUL if found.warnings else 0
-    code = code if found.verdict is None else GATE_CODES[found.verdict.decision]
-    lines, gate = found.describe([] if out is None else [("Wrote", str(out))]), list_gate(found.verdict)
-    lines[len(lines) - len(gate) :] = [*([found.details()] if details else []), *gate]
-    return Answer(found.to_dict(), "\n".join(lines), code)
+    with as_bad_input(ValueError):
+        _ = Question(env_id=scenarios[0], **asked).run_arguments
+        of_sum: dict[str, Any] = {"scenarios": scenarios, "sites": options.split_words([sites]), "bases": bases}
+        found = risk(ego, out=out, progress=True, force=force, executor=executor, **of_sum, **asked)
+    return tell(found, out, details)
 
 
 @command(
-    *(*shell.SCENARIO, "measure", "gamma", "method", "max_sim", "confidence", "seed"),
+    *(*options.SCENARIO, "measure", "gamma", "method", "max_sim", "confidence", "seed"),
     *("max_ratio", "assume_traffic", "workers", "trust"),
-    more=("env_id", *shell.WORLD_IN_FILES, *shell.RUN_IN_FILES),
+    more=("env_id", *options.WORLD_IN_FILES, *options.RUN_IN_FILES),
     texts=("algo_b", "stats_b"),
     stopped=NOTHING_MADE,
     max_sim={"help": "Largest number of simulations, of both egos together.", "show_default": "12,000"},
@@ -324,75 +287,51 @@ def compare_command(
     ego_a: Annotated[str, Argument(metavar="EGO_A", help="Policy A, the one before, as for estimate --ego.")],
     ego_b: Annotated[str, Argument(metavar="EGO_B", help="Policy B, the new one.")],
     asked: dict[str, Any],
+    executor: Any,
     env: Annotated[str | None, Argument(metavar="SCENARIO", help="Scenario; those of risk by default.")] = None,
     algo_b: str | None = None,
     stats_b: str | None = None,
     out: Annotated[Path | None, Option(help="Folder for comparison.json and failures.csv.")] = None,
-    force: shell.ForceOption = False,
-    details: shell.DetailsOption = False,
+    force: options.ForceOption = False,
+    details: options.DetailsOption = False,
 ) -> Answer:
     """Estimate how many times likelier ego A fails than ego B, in a scenario or summed over those of risk."""
-    from rare_envs.study.evaluate import compare_egos
+    asked["max_sim"] = asked["max_sim"] or PAIR_SIMULATIONS
+    how: dict[str, Any] = {"out": out, "progress": True, "force": force, "executor": executor}
+    how |= {"algo_b": algo_b, "stats_b": stats_b}
+    if env is not None:
+        from rare_envs.study.evaluate import compare_egos
 
-    env = env or asked.pop("env_id")
-    if env is None:
-        return _compare_risks(ego_a, ego_b, {**asked, "algo_b": algo_b, "stats_b": stats_b}, out, force, details)
-    question, executor = _ask(env, {**asked, "max_sim": asked["max_sim"] or PAIR_SIMULATIONS}, ego=ego_a)
-    tell = partial(_tell_comparison, details)
-    b: dict[str, Any] = {"algo_b": algo_b, "stats_b": stats_b}
-    with shell.telling_unwritten(tuple, tell):
-        pair = compare_egos(question, ego_b, progress=True, out=out, force=force, executor=executor, **b)
-    return tell(pair, out)
+        return tell(compare_egos(_ask(env, {**asked, "ego": ego_a}), ego_b, **how), out, details)
+    from rare_envs.study.risk import SCENARIO_SET, compare_risks
 
-
-def _compare_risks(
-    ego_a: str, ego_b: str, asked: dict[str, Any], out: Path | None, force: bool, details: bool
-) -> Answer:
-    """Compare two egos in the scenarios of risk."""
-    from rare_envs.study.risk import SCENARIO_SET, RiskComparison, compare_risks
-
-    executor, base, tell = _make_executor(asked), asked.pop("base"), partial(_tell_risk, details)
-    options = {name: value for name, value in asked.items() if name not in (*shell.EXECUTOR, "env_id")}
-    options |= {"bases": _read_bases([base] if base else [], SCENARIO_SET)}
-    options |= {"max_sim": asked["max_sim"] or PAIR_SIMULATIONS, "executor": executor}
-    with as_bad_input(ValueError), shell.telling_unwritten(RiskComparison, tell):
-        found = compare_risks(ego_a, ego_b, out=out, progress=True, force=force, **options)
-    return tell(found, out)
+    base = asked.pop("base")
+    with as_bad_input(ValueError):
+        bases = _read_bases([base] if base else [], SCENARIO_SET)
+        return tell(compare_risks(ego_a, ego_b, bases=bases, **how, **asked), out, details)
 
 
-def _tell_comparison(details: bool, pair: tuple[Comparison, dict[str, Any]], out: Path | None = None) -> Answer:
-    """Return the answer of a comparison."""
-    from rare_envs.study.text import list_gate
-
-    (found, answer), asked = pair, pair[1]["question"]
-    verdict = None if asked["max_ratio"] is None else found.meets(asked["max_ratio"], asked["assume_traffic"])
-    lines = [*answer["text"], *(["", found.details(), "", found.either.details()] if details else [])]
-    lines += [*([] if out is None else [f"Wrote {out}."]), *list_gate(verdict)]
-    code = (DOUBTFUL if found.warnings else 0) if verdict is None else GATE_CODES[verdict.decision]
-    return Answer(answer, "\n".join(lines), code)
-
-
-@command(*shell.EXECUTOR, "trust", stopped="Stopped before the run went on; what it had kept is still there.")
+@command(*EXECUTOR, "trust", stopped="Stopped before the run went on; what it had kept is still there.")
 def resume_command(
     run: Annotated[Path, Argument(metavar="RUN", help="Folder of --out of an interrupted estimate, risk or compare.")],
     asked: dict[str, Any],
+    executor: Any,
     ego: Annotated[str | None, Option(help="New address of an ego in another program, tcp://HOST:PORT.")] = None,
     on_error: Annotated[str | None, Option(help="New value of on_error: raise, failure or bound.")] = None,
     mend: Annotated[
         bool, Option("--mend", help="Keep the simulations before the damage of a damaged journal.")
     ] = False,
-    details: shell.DetailsOption = False,
+    details: options.DetailsOption = False,
 ) -> Answer:
     """Continue an interrupted estimate, risk or compare; the result is the same as without the interruption."""
     from rare_envs.study import evaluate, writing
 
-    executor, trust = _make_executor(asked), asked["trust"]
+    trust = asked["trust"]
     folder, whole, questions = writing.find_whole(run, mend)
     if whole and (ego or on_error):
         raise BadInput(f"Expected --ego and --on-error with a run of rare-envs estimate; {str(run)!r} has another.")
     if not whole:
-        report = evaluate.resume(run, ego, on_error, trust, progress=True, executor=executor)
-        return describe_report(report, run, details)
+        return tell(evaluate.resume(run, ego, on_error, trust, progress=True, executor=executor), run, details)
     if whole["command"] == "estimate":
         from rare_envs.study.question import open_question
 
@@ -400,13 +339,9 @@ def resume_command(
         opened = open_question(asdict(question), folder, trust, core=question.core, device=question.device)
         return estimate_highway_env(opened, whole["env_config"], folder, False, details, executor)
     if whole["command"] == "compare":
-        with shell.telling_unwritten(tuple, partial(_tell_comparison, details)):
-            return _tell_comparison(details, evaluate.resume_comparison(folder, questions, trust, executor), folder)
-    from rare_envs.study.risk import Risk, RiskComparison, resume_compared_risks, resume_risk
+        return tell(evaluate.resume_comparison(folder, questions, trust, executor), folder, details)
+    from rare_envs.study.risk import resume_compared_risks, resume_risk
 
-    if whole["command"] == writing.SUM:
-        with as_bad_input(ValueError), shell.telling_unwritten(RiskComparison, partial(_tell_risk, details)):
-            compared = resume_compared_risks(folder, questions, whole, trust=trust, executor=executor)
-            return _tell_risk(details, compared, folder)
-    with as_bad_input(ValueError), shell.telling_unwritten(Risk, partial(_tell_risk, details)):
-        return _tell_risk(details, resume_risk(folder, questions, whole, trust=trust, executor=executor), folder)
+    resume = resume_compared_risks if whole["command"] == writing.SUM else resume_risk
+    with as_bad_input(ValueError):
+        return tell(resume(folder, questions, whole, trust=trust, executor=executor), folder, details)

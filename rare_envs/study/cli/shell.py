@@ -1,4 +1,4 @@
-"""What all commands share: options from the fields of questions, answers as text or JSON, errors in one line."""
+"""What all commands share: answers as text or JSON, errors in one line, and signals."""
 
 from __future__ import annotations
 
@@ -16,32 +16,19 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_type_hints
+from typing import Any, NamedTuple, NoReturn
 
 import typer
-from typer import Argument, Option
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone, clean_text
 from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
-from rare_envs.study.arguments import (
-    GATE_CODES,
-    KEYS,
-    BadInput,
-    ExecutorOptions,
-    Question,
-    UnwrittenResults,
-    option_name,
-    read_question_file,
-    read_whole,
-)
+from rare_envs.study.arguments import GATE_CODES, KEYS, BadInput, ExecutorOptions, as_bad_input, read_question_file
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
 LONGEST_LINE = 4_000
 """Characters of an error or a warning: files and names may bring along any number."""
-WHOLE = 1_000
-"""Characters of a summary in a list of commands: more than any has."""
 _SIGPIPE = int(getattr(signal, "SIGPIPE", 13))
 """Signal of a reader that is gone; Windows has none of this number."""
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)]
@@ -57,50 +44,7 @@ _PLAIN_WORDS = (
 """What Typer says of a wrong value in words of the library that it checks values with, and what is said instead."""
 
 
-PANELS = {
-    "Ego and scenario": "ego base scenario sites drivers observation action",
-    "Question": "measure gamma",
-    "Precision and budget": "method max_sim target_cov confidence plan",
-    "Gate": "max_p max_rate max_ratio assume_traffic",
-    "Run": "seed workers executor address time_limit memory_limit on_error mend config trust",
-    "Output": "out force details as_json help",
-}
-"""Titles of the sections of a help page and their options, most used first; others are in a section before these."""
-FEW = 12
-"""Options of a command that need no sections."""
-
-
-class PanelCommand(TyperCommand):
-    """A command whose options are in the sections `PANELS` on its help page, if they are many."""
-
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments, and the options in their sections."""
-        options = {each.name: each for each in self.get_params(ctx) if each.param_type_name == "option"}
-        panels = {title: names.split() for title, names in PANELS.items()}
-        listed = [name for names in panels.values() for name in names]
-        panels = {"Options": [name for name in options if name not in listed], **panels}
-        if len(options) <= FEW:
-            panels = {"Options": [name for names in panels.values() for name in names]}
-        sections = {"Arguments": [each for each in self.get_params(ctx) if each.name not in options]}
-        sections |= {title: [options[name] for name in names if name in options] for title, names in panels.items()}
-        for title, parameters in sections.items():
-            if rows := [row for each in parameters if (row := each.get_help_record(ctx))]:
-                with formatter.section(title):
-                    formatter.write_dl(rows)
-
-
-class SummarisedCommands(TyperGroup):
-    """Commands whose summaries are not cut in the list of them."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands, each with the whole first sentence of its help, in several lines where it is long."""
-        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [(name, found.get_short_help_str(limit=WHOLE)) for name, found in commands if found is not None]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
-
-
-class OneLineErrors(SummarisedCommands):
+class OneLineErrors(TyperGroup):
     """Commands whose errors are one line on standard error and exit code 2."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -199,10 +143,8 @@ def advise_elsewhere(error: Exception, words: Sequence[str]) -> str:
     parameters = getattr(getattr(context, "command", None), "params", ())
     if (better := SYNONYMS.get(option)) in [name for each in parameters for name in each.opts]:
         return f"No such option {option}: it is {better}."
-    key, keys = (
-        option.lstrip("-").replace("-", "_"),
-        _file_keys(context),
-    )
+    keys = getattr(getattr(getattr(context, "command", None), "callback", None), "file_keys", ())
+    key = option.lstrip("-").replace("-", "_")
     is_off = key.startswith("no_") and key[3:] in keys
     key = key[3:] if is_off else key
     if key not in keys:
@@ -212,12 +154,6 @@ def advise_elsewhere(error: Exception, words: Sequence[str]) -> str:
     if key in KEYS and KEYS[key].type == "bool":
         value = "false" if is_off else "true"
     return f"No such option {option}: put {key}: {value} into a file for --config."
-
-
-def _file_keys(context: Any) -> Sequence[str]:
-    """Return the keys that the file of --config may have for the command of a context."""
-    callback = getattr(getattr(context, "command", None), "callback", None)
-    return tuple(getattr(callback, "file_keys", ()))
 
 
 def name_options(message: str, command: Any) -> str:
@@ -332,44 +268,93 @@ class Answer(NamedTuple):
                 raise
 
 
-def describe_report(report: Any, out: Path | None, details: bool) -> Answer:
-    """Return the answer of a `Report`, of a run in a folder `out` or of none."""
-    from rare_envs.study.text import print_report, report_as_json
+def tell(found: Any, out: Path | None = None, details: bool = False) -> Answer:
+    """Return the answer of a report, a risk, two compared risks, or a comparison and its values for JSON.
 
-    doubtful = DOUBTFUL if report.doubtful else 0
-    show = functools.partial(print_report, report, out, details)
-    code = doubtful if report.verdict is None else GATE_CODES[report.verdict.decision]
-    return Answer(report_as_json(report), show, code)
+    `out` is the folder that was written, if any. An answer stays what it is.
+    """
+    if isinstance(found, Answer):
+        return found
+    from rare_envs.study.report import Report
+    from rare_envs.study.text import list_gate, print_report, report_as_json
+
+    if isinstance(found, Report):
+        show, verdict = functools.partial(print_report, found, out, details), found.verdict
+        return Answer(report_as_json(found), show, _find_code(verdict, found.doubtful))
+    if isinstance(found, tuple):
+        compared, data = found
+        limit, exact = (data["question"][name] for name in ("max_ratio", "assume_traffic"))
+        verdict = None if limit is None else compared.meets(limit, exact)
+        more = ["", compared.details(), "", compared.either.details()] if details else []
+        lines = [*data["text"], *more, *([] if out is None else [f"Wrote {out}."]), *list_gate(verdict)]
+        return Answer(data, "\n".join(lines), _find_code(verdict, compared.warnings))
+    lines, gate = found.describe([] if out is None else [("Wrote", str(out))]), list_gate(found.verdict)
+    lines[len(lines) - len(gate) :] = [*([found.details()] if details else []), *gate]
+    return Answer(found.to_dict(), "\n".join(lines), _find_code(found.verdict, found.warnings))
 
 
-def answering(work: Callable[[], Answer | None], as_json: bool, stopped: str, details: bool) -> None:
-    """Do the work of a command, print its answer, if any, and exit."""
+def _find_code(verdict: Any, doubtful: Any) -> int:
+    """Return the exit code of an answer with a verdict, or with none."""
+    return GATE_CODES[verdict.decision] if verdict is not None else DOUBTFUL if doubtful else 0
+
+
+class Command(NamedTuple):
+    """A function that is a command, and what is known of its options, see `options.command`."""
+
+    function: Callable[..., Any]
+    names: Sequence[str]
+    more: Sequence[str]
+    texts: Sequence[str]
+    file_keys: Sequence[str]
+    """What the file of --config may have."""
+    stopped: str
+
+
+FIELDS = {field.name: field for field in KEYS.values()}
+"""Fields of `Question` and `ExecutorOptions` by name."""
+EXECUTOR = tuple(field.name for field in fields(ExecutorOptions))
+NOISE = {"on": True, "fixed": "fixed", "off": False}
+"""Words of --noise for the `noise` argument of `DrivingProblem`."""
+
+
+def run_command(
+    asked: Command, *, context: typer.Context, as_json: bool = False, config: Path | None = None, **values: Any
+) -> None:
+    """Do the work of a command with what was typed and what its file says, print its answer, if any, and exit."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    typed = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+    filed = {} if config is None else read_question_file(config, asked.file_keys, asked.texts)
+    known: dict[str, Any] = {name: FIELDS[name].default for name in asked.more if name != "env_id"}
+    known |= {name: values.pop(name) for name in asked.names}
+    known |= {"noise": NOISE[known["noise"]]} if "noise" in asked.names else {}
+    taken = inspect.signature(asked.function).parameters
+    for name in filed.keys() - typed:
+        if name in asked.texts:
+            values[name] = [filed[name]] if "list" in str(taken[name].annotation) else filed[name]
+        elif name != "env_id":
+            known[name] = filed[name]
+        elif values["env"] is None:
+            values["env"] = filed[name]
+    where = {name: known.pop(name) for name in EXECUTOR if name in known}
+    values |= {name: value for name, value in (("asked", known), ("typed", typed | set(filed))) if name in taken}
     try:
         with use_one_thread(), keep_stdout_for_the_answer():
-            answer = work()
+            if "executor" in taken:
+                with as_bad_input(ValueError):
+                    values["executor"] = ExecutorOptions(**where).make()
+            answer = asked.function(**values)
     except (KeyboardInterrupt, BadInput) as error:
-        report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
+        report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`
         # whoever ended the process may not wait for more than one line
         own = type(error) is not KeyboardInterrupt  # such as `RunInterrupted`, with words of its own
-        if isinstance(error, KeyboardInterrupt) and (own or stopped):
-            print_stderr(str(error) if own else stopped)
+        if isinstance(error, KeyboardInterrupt) and (own or asked.stopped):
+            print_stderr(str(error) if own else asked.stopped)
         if report is not None:
-            (report if isinstance(report, Answer) else describe_report(report, None, details)).print(as_json)
+            tell(report, None, values.get("details", False)).print(as_json)
         raise
     if answer is not None:
         answer.print(as_json)
         raise typer.Exit(answer.code)
-
-
-@contextlib.contextmanager
-def telling_unwritten(kind: type[Any], tell: Callable[[Any], Answer]) -> Iterator[None]:
-    """Let the result, of a kind, of what cannot be written be told as an answer."""
-    try:
-        yield
-    except UnwrittenResults as error:
-        if isinstance(error.report, kind):
-            error.report = tell(error.report)
-        raise
 
 
 @contextlib.contextmanager
@@ -389,130 +374,3 @@ def keep_stdout_for_the_answer() -> Iterator[None]:
                 ctypes.CDLL(None).fflush(None)  # what C's standard library still has to write
             os.dup2(answer, 1)
             os.close(answer)
-
-
-SCENARIO = ("base", "drivers", "observation", "action")
-"""Fields of `Question` that are options of each command that drives an ego."""
-WORLD_IN_FILES = ("horizon", "noise", "weather", "collisions", "algo", "stats")
-RUN_IN_FILES = ("chunk", "core", "device", "ensemble_run", "executor", "address", "time_limit", "memory_limit")
-"""Fields that files alone give to commands that estimate: of the scenario and the ego, and of the run."""
-EGO_FILE = ("algo", "stats")
-EXECUTOR = tuple(field.name for field in fields(ExecutorOptions))
-NOISE = {"on": True, "fixed": "fixed", "off": False}
-"""Words of --noise for the `noise` argument of `DrivingProblem`."""
-KINDS: dict[str, Any] = {"noise": Literal["on", "fixed", "off"], "executor": Literal["local", "ray"] | None}
-"""Types of options of which the fields have another."""
-OWNERS = {field.name: owner for owner in (Question, ExecutorOptions) for field in fields(owner)}
-"""The class that has a field."""
-
-
-def read_count(text: str) -> int:
-    """Return the whole number that a text stands for, such as "10000" or "1e4"."""
-    try:
-        return read_whole(text)
-    except ValueError:
-        raise typer.BadParameter(f"expected a whole number, such as 10000 or 1e4, got {text!r}.") from None
-
-
-def split_words(*texts: str) -> list[str]:
-    """Return the words of texts in which commas stand between words."""
-    return [word.strip() for text in texts for word in text.split(",") if word.strip()]
-
-
-def read_environment(text: str | None) -> str | None:
-    """Return the id of an environment with its namespace, where it was typed without."""
-    from rare_envs.scenarios.registry import complete_id
-
-    return None if text is None else complete_id(text)
-
-
-def option_of(name: str, **changes: Any) -> Any:
-    """Return the option of a field, with changes to what `typer.Option` is told."""
-    field = next(each for each in fields(OWNERS[name]) if each.name == name)
-    about = {key: field.metadata[key] for key in ("help", "show_default") if key in field.metadata} | changes
-    if field.metadata.get("count"):
-        return Option(parser=read_count, metavar="INTEGER", **about)
-    return Option(f"--{option_name(field).replace('_', '-')}", **about)
-
-
-EnvArgument = Annotated[
-    str,
-    Argument(
-        metavar="SCENARIO",
-        help="Scenario: CutIn, cut-in and rare_envs/CutIn-v1 are the same.",
-        callback=read_environment,
-    ),
-]
-EgoArgument = Annotated[str, Argument(metavar="EGO", help="Policy under test, as for estimate --ego.")]
-RunArgument = Annotated[Path, Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")]
-ForceOption = Annotated[bool, Option("--force", help="Replace what is there already.")]
-DetailsOption = Annotated[bool, Option("--details", help="Print the method, all intervals, parameters and remarks.")]
-JsonOption = Annotated[bool, Option("--json", help="Print one JSON object and nothing else.")]
-
-
-def command(
-    *names: str, more: Sequence[str] = (), texts: Sequence[str] = (), stopped: str = "", **about: Mapping[str, str]
-) -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:
-    """Let a function be a command of Typer: the answer that it returns, if any, is printed, as JSON with --json.
-
-    Its parameter `asked` becomes the options of these fields of `Question` and `ExecutorOptions`, and it gets a mapping
-    of them and of `more`, which are in the file of --config alone. The file may give all of these, and parameters of
-    the function that are `texts`. `typed` gets the names of what was typed or filed. `stopped` is said of an early
-    interruption. `about` has the words of options that are others than those of the fields.
-    """
-    keys = [option_name(field) for owner in (Question, ExecutorOptions) for field in fields(owner)]
-    keys = [key for key in keys if KEYS[key].name in (*names, *more)]
-
-    def decorate(function: Callable[..., Answer | None]) -> Callable[..., None]:
-        signature = inspect.signature(function, eval_str=True)
-        taken = signature.parameters
-
-        @functools.wraps(function)
-        def run(context: typer.Context, as_json: bool = False, config: Path | None = None, **values: Any) -> None:
-            sources = {name: context.get_parameter_source(name) for name in context.params}
-            typed = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
-            filed = {} if config is None else read_question_file(config, keys, texts)
-            known = {name: getattr(OWNERS[name], name, None) for name in more}
-            for name in names:
-                value = values.pop(name)
-                known[name] = NOISE[value] if name == "noise" else value
-            for name, value in filed.items():
-                if name in known and name not in typed:
-                    known[name] = value
-                elif name in texts and name not in typed:
-                    values[name] = [value] if "list" in str(taken[name].annotation) else value
-            values |= {"asked": known} if "asked" in taken else {}
-            values |= {"typed": typed | set(filed)} if "typed" in taken else {}
-            answering(functools.partial(function, **values), as_json, stopped, values.get("details", False))
-
-        keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
-        parameters = [keyword("context", annotation=typer.Context)]
-        for name, parameter in taken.items():
-            if name == "asked":
-                kinds: Any = {**get_type_hints(Question), **get_type_hints(ExecutorOptions), **KINDS}
-                for each in names:
-                    default = "on" if each == "noise" else getattr(OWNERS[each], each)
-                    parameters.append(
-                        keyword(
-                            each,
-                            default=default,
-                            annotation=Annotated[kinds[each], option_of(each, **about.get(each, {}))],
-                        )
-                    )
-            elif name not in ("typed", *(text for text in texts if parameter.annotation in (str, str | None))):
-                parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-        if more:
-            only = ", ".join(key for key in keys if KEYS[key].name in more)
-            help = (
-                f"YAML file of options (key: value), which the command line overrides, and of further settings: {only}."
-            )
-            parameters.append(keyword("config", default=None, annotation=Annotated[Path | None, Option(help=help)]))
-        if signature.return_annotation is not None:
-            parameters.append(keyword("as_json", default=False, annotation=JsonOption))
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {each.name: each.annotation for each in parameters}
-        run.file_keys = (*keys, *texts)  # type: ignore[attr-defined]
-        del run.__wrapped__
-        return run
-
-    return decorate

@@ -134,7 +134,7 @@ def test_an_ego_is_trained_on_with_the_failures_of_its_runs(cli: Cli, risky: str
     assert f"--base {risky} --seed 8" in printed.replace("  ", " ")
     one = ("train-ego", "--from-failures", runs[0], "--out", on, "--force")
     assert_refused(cli(*one, "--algo", "ppo"), "Expected --algo a2c", "'ppo'")
-    assert_refused(cli("train-ego", "rare_envs/CutIn-v0", *one[1:]), f"Expected ENV {FOLLOWING}")
+    assert_refused(cli("train-ego", "rare_envs/CutIn-v0", *one[1:]), f"Expected SCENARIO {FOLLOWING}")
     assert_refused(cli(*one, "--failure-share", 1), "share of failures above 0 and below 1")
 
 
