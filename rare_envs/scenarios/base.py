@@ -249,7 +249,8 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     if isinstance(found, Path) and (not found.exists() or found.is_dir()):
         raise ValueError(
             f"No traffic model {str(base)!r} for {scenario.name}"
-            f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
+            f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file. "
+            "Of recordings rare-envs fit makes one."
         )
     try:
         text = read_text_file(found) if isinstance(found, Path) else found.read_text(encoding="utf-8")
@@ -264,7 +265,11 @@ Known: TypeAlias = FileDistribution | FittedDistribution
 @lru_cache(maxsize=64)
 def _read_text(scenario: str, names: tuple[str, ...], source: str, text: str) -> Known:
     """Return the distribution of a text. It is kept: a file has some 100 refits, an environment is made often."""
-    return _read(scenario, names, source, parse_json_object(text, f"Traffic model {source}"))
+    try:
+        data = parse_json_object(text, f"Traffic model {source}")
+    except ValueError as error:
+        raise ValueError(f"{error} Of recordings rare-envs fit makes a traffic model.") from None
+    return _read(scenario, names, source, data)
 
 
 def _read(scenario: str, names: tuple[str, ...], source: str, data: Mapping[str, Any]) -> Known:

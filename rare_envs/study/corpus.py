@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import math
 import reprlib
@@ -107,13 +108,13 @@ def parse_stored(text: str, source: str) -> StoredFailure:
         raise ValueError(f"{source}: expected format {STORED_FORMAT}, got {reprlib.repr(content.get('format'))}.")
     values: dict[str, Any] = {each.name: content.get(each.name) for each in fields(StoredFailure)}
     words, world, x = [values[name] for name in ("env_id", "ego", "crash")], values["world"], values["x"]
-    numbers = [values[name] for name in ("f", "log_p0") if values[name] is not None]
     if not (
         all(isinstance(word, str) and len(word) <= MAX_WORD for word in words)
         and isinstance(values["base"], str | None)
         and (isinstance(world, dict) and set(world) == set(WORLD_FIELDS))
         and (isinstance(x, dict) and x and all(isinstance(row, list) for row in x.values()))
-        and all(map(_is_number, [world["gamma"], *numbers, *(value for row in x.values() for value in row)]))
+        and all(values[name] is None or _is_number(values[name]) for name in ("f", "log_p0"))
+        and all(map(_is_number, [world["gamma"], *itertools.chain(*x.values())]))
     ):
         raise ValueError(
             f"{source} is no stored failure: expected env_id, ego and crash of up to {MAX_WORD} letters, a base, "
@@ -128,7 +129,7 @@ def parse_stored(text: str, source: str) -> StoredFailure:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
 
 
 def read_corpus(folder: Path) -> list[StoredFailure]:
@@ -192,9 +193,8 @@ def join_x(failures: Sequence[StoredFailure], space: ScenarioSpace) -> NDArray[n
         try:
             rows.append(join_parts(failure.x, space))
         except ValueError as error:
-            raise ValueError(
-                f"Stored failure {failure.key} {error}: {failure.env_id} or its drivers have changed since."
-            ) from error
+            wrong = f"Stored failure {failure.key} {error}: {failure.env_id} or its drivers have changed since."
+            raise ValueError(wrong) from error
     return np.array(rows, dtype=np.float64)
 
 
@@ -264,16 +264,16 @@ def try_ego(
 
 def try_world(problem: DrivingProblem, failures: Sequence[StoredFailure]) -> list[Trial]:
     """Return the trials of the ego of a problem in scenarios of its world."""
-    x, trials = problem.space.validate(join_x(failures, problem.space)), []
+    x = problem.space.validate(join_x(failures, problem.space))
     f, reasons = problem.attempt(x)
     failed = [k for k in range(len(x)) if k not in reasons and f[k] <= failures[k].gamma]
     kinds = dict(zip(failed, problem.crash_kinds(x[failed]) if failed else (), strict=True))
-    for k, failure in enumerate(failures):
-        if k in reasons:
-            trials.append(Trial(failure, "error", math.nan, reason=reasons[k]))
-        else:
-            trials.append(Trial(failure, "failed" if k in kinds else "passed", float(f[k]), kinds.get(k, "")))
-    return trials
+    return [
+        Trial(failure, "error", math.nan, reason=reasons[k])
+        if k in reasons
+        else Trial(failure, "failed" if k in kinds else "passed", float(f[k]), kinds.get(k, ""))
+        for k, failure in enumerate(failures)
+    ]
 
 
 def write_junit(path: Path, trials: Sequence[Trial], ego: str, seconds: float) -> None:
@@ -310,7 +310,7 @@ class RetrainingPlan(NamedTuple):
     algo: str
     """Algorithm of the ego."""
     world: Mapping[str, Any]
-    """Keyword arguments of the environment, `TRAINED_FIELDS`."""
+    """Keyword arguments of the environment, `TRAINED_FIELDS`, and trust where it was given."""
     retraining: Retraining
     next_seed: int
     """Least seed above those of the runs, for an estimate that shares no draw with them."""
@@ -336,12 +336,13 @@ def plan_retraining(folders: Sequence[Path], share: float, trust: bool = False) 
         raise BadInput(f"Expected a run of an ego that train-ego has saved (.zip) in {place}, got {last.ego!r}.")
     world = {name: getattr(last, name) for name in TRAINED_FIELDS}
     world |= {"observation": last.observation or "features", "action": last.action or "continuous"}
+    world |= {"trust": True} if trust else {}
     with as_bad_input(ValueError, OSError):
         saved = load_saved_ego(Path(last.ego), last.algo, trust, last.stats)
         if saved.statistics is not None:
             raise ValueError(
                 f"Cannot train {last.ego!r} on: it was trained behind VecNormalize, which train-ego has not."
             )
-        _, space = set_up(last.env_id, **world, trust=trust)
+        _, space = set_up(last.env_id, **world)
         retraining = Retraining(Path(last.ego), join_x(failures, space), share)
     return RetrainingPlan(last.env_id, saved.algorithm, world, retraining, 1 + max(each.seed for each in questions))

@@ -35,13 +35,9 @@ from rare_envs.traffic.road import Road, list_cells
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from samplers.problem import FloatArray
 
-EXPORT_FORMATS = {
-    "openscenario": "ASAM OpenSCENARIO XML 1.2 (.xosc) with its road as OpenDRIVE 1.6 (.xodr) beside it",
-    "carla": "the same in OpenSCENARIO 1.0 for CARLA's scenario_runner, with a free ego",
-    "commonroad": "CommonRoad XML 2020a (.xml)",
-}
-"""Formats of `export_drive`, in words."""
-_ENDINGS = {"openscenario": ".xosc", "carla": ".xosc", "commonroad": ".xml"}
+EXPORT_FORMATS = {"openscenario": ".xosc", "carla": ".xosc", "commonroad": ".xml"}
+"""Formats of `export_drive` and the endings of their files: OpenSCENARIO XML 1.2 with its road as OpenDRIVE 1.6 (.xodr)
+beside it; the same in OpenSCENARIO 1.0 for CARLA's scenario_runner, with a free ego; CommonRoad XML 2020a."""
 _MARGIN = 150.0
 """Road before the first and after the last place of a vehicle [m], for egos that drive on."""
 
@@ -116,14 +112,14 @@ def export_drive(
 def check_export(path: Path | str, format: str, ego: str | None) -> bool:
     """Return whether the ego is left free."""
     if format not in EXPORT_FORMATS:
-        raise ValueError(
-            f"Expected a format of {', '.join(EXPORT_FORMATS)}, got {format!r}{did_you_mean(format, EXPORT_FORMATS)}."
-        )
-    path = Path(path)
-    if path.suffix.lower() != _ENDINGS[format]:
-        others = [name for name, ending in _ENDINGS.items() if ending == path.suffix.lower()]
-        hint = f"; --format {others[0]} writes such a file" if others else ""
-        raise ValueError(f"Expected a file that ends in {_ENDINGS[format]} for {format}, got {str(path)!r}{hint}.")
+        *others, last = EXPORT_FORMATS
+        hint = did_you_mean(format, EXPORT_FORMATS)
+        raise ValueError(f"Expected format {', '.join(others)} or {last}, got {format!r}{hint}.")
+    path, ending = Path(path), EXPORT_FORMATS[format]
+    if path.suffix.lower() != ending:
+        fits = [name for name, its_ending in EXPORT_FORMATS.items() if its_ending == path.suffix.lower()]
+        hint = f"; --format {fits[0]} writes such a file" if fits else ""
+        raise ValueError(f"Expected a file that ends in {ending} for {format}, got {str(path)!r}{hint}.")
     if ego not in ("recorded", "free", None):
         raise ValueError(f"Expected an ego recorded or free, got {ego!r}.")
     if format == "carla" and ego == "recorded":

@@ -425,7 +425,10 @@ def _choose_scenarios(
         raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
     known = sorted({name for scenario in scenarios for name in list_sites(scenario)})
     if not known:
-        raise ValueError(f"No base of {', '.join(names)} is of a site, so that there is no rate.")
+        raise ValueError(
+            f"No base of {', '.join(names)} is of a site where events were counted, so there is no rate: "
+            "rare-envs estimate gives the probability in a scenario."
+        )
     for site in (each for each in sites if each not in known):
         owner, there = next((each.name for each in scenarios if site in each.bases), ""), ", ".join(map(repr, known))
         if owner:

@@ -101,37 +101,28 @@ def _of_any_chunk(head: Mapping[str, Any]) -> dict[str, Any]:
 def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], dict[str, Question]]:
     """Return the folder of an unfinished run, its command with arguments, and the questions of the parts begun.
 
-    The command is empty for a single estimate; a folder of a part of a comparison means that of the comparison.
+    The command is empty for a single estimate; a folder of a part of a comparison means that of the comparison. Parts
+    are named by their folders in it, those of a comparison summed over scenarios by their whole paths.
     """
-    if sums := sorted(path.parent for path in folder.glob(f"*/*/{run_folder.JOURNAL}")):
-        return _find_sum(folder, sums, mend)
-    parts = [""] if (folder / run_folder.JOURNAL).exists() else []
-    parts += [path.parent.name for path in sorted(folder.glob(f"*/{run_folder.JOURNAL}"))]
-    whole, questions = dict[str, Any](), dict[str, Question]()
-    for part in parts or [""]:
-        journal, questions[part] = continue_journal(folder / part, mend)
-        found = dict(journal.head.get("whole") or {})
-        journal.close()
-        if found.get("command") == SUM or (part == "" and found.get("command") == "compare"):
-            return find_whole(folder.parent, mend)
-        if part == "":
-            return folder, found if found.get("command") == "estimate" else {}, questions
-        if not found or whole not in ({}, found):
-            raise BadInput(f"{str(folder)!r} has several runs: continue each, such as {advise_resume(folder / part)}.")
-        whole = found
-    return folder, whole, questions
-
-
-def _find_sum(folder: Path, parts: Sequence[Path], mend: bool) -> tuple[Path, dict[str, Any], dict[str, Question]]:
-    """Return the same of a comparison that is summed over scenarios, of the folders of its journals."""
+    name = run_folder.JOURNAL
+    sums, own, parts = sorted(folder.glob(f"*/*/{name}")), [folder / name], sorted(folder.glob(f"*/{name}"))
+    paths = sums or (own if own[0].exists() or not parts else parts)
     wholes, questions = list[dict[str, Any]](), dict[str, Question]()
-    for part in parts:
-        journal, questions[str(part)] = continue_journal(part, mend)
+    for path in paths:
+        part = path.parent
+        journal, question = continue_journal(part, mend)
+        questions[str(part) if sums else "" if paths is own else part.name] = question
         wholes.append(dict(journal.head.get("whole") or {}))
         journal.close()
-    if wholes[0].get("command") != SUM or any(each != wholes[0] for each in wholes):
-        raise BadInput(f"{str(folder)!r} has several runs: continue each, such as {advise_resume(parts[0].parent)}.")
-    return folder, wholes[0], questions
+    whole, command = wholes[0], wholes[0].get("command")
+    if not sums and (command == SUM or (paths is own and command == "compare")):
+        return find_whole(folder.parent, mend)
+    if paths is own:
+        return folder, whole if command == "estimate" else {}, questions
+    if not whole or any(each != whole for each in wholes) or (sums and command != SUM):
+        again = advise_resume(paths[0].parent.parent if sums else paths[0].parent)
+        raise BadInput(f"{str(folder)!r} has several runs: continue each, such as {again}.")
+    return folder, whole, questions
 
 
 def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
@@ -227,7 +218,7 @@ def check_no_results(folder: Path, *names: str) -> None:
 
 
 def _remove_results(folder: Path) -> None:
-    """Remove the results of an earlier run."""
+    """Remove the results of an earlier run, and the drafts of one that was killed while it wrote."""
     for name in run_folder.RESULT_FILES:
         (folder / name).unlink(missing_ok=True)
     remove_evidence(folder)
@@ -242,7 +233,7 @@ def remove_evidence(folder: Path) -> None:
 
 
 def _remove_drafts(folder: Path) -> None:
-    """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
+    """Remove drafts of results, see `rare_envs.files.replace_file`."""
     for name in map(Path, run_folder.RESULT_FILES):
         for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
             with contextlib.suppress(OSError):  # a folder of that name is none
@@ -269,7 +260,15 @@ def write_run(folder: Path, report: Report) -> None:
     space, faults, kinds = report.study.problem.space, report.faults, report.kinds
     replace_text(folder / run_folder.RESULT, format_json(report_as_json(report)) + "\n")
     nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in run_folder.CRASH[1:]))
-    crashes = [_list_crash(each) or nobody for each in report.crashes]
+    crashes = [
+        (
+            *(each["kind"], *each["vehicles"], each["impact_speed"], each["closing_speed"]),
+            *(*each["delta_v"], *each["injury_risk"]),
+        )
+        if each is not None
+        else nobody
+        for each in report.crashes
+    ]
     write_failures(folder, space, report.estimate.failures, crashes, kinds.others_listed)
     for name in (run_folder.FAULTS, run_folder.FAULT_BLOCKS, *run_folder.PICTURES):
         (folder / name).unlink(missing_ok=True)
@@ -283,14 +282,6 @@ def write_run(folder: Path, report: Report) -> None:
     if kinds.severity is not None and kinds.severity.largest_delta_v > SEVERE:
         with saved_figure(folder / run_folder.SEVERITY, 3.6) as figure:
             kinds.severity.plot(figure.subplots())
-
-
-def _list_crash(crash: dict[str, Any] | None) -> tuple[Any, ...]:
-    """Return a crash as the columns `CRASH`; () if there is none."""
-    if crash is None:
-        return ()
-    speeds = (crash["impact_speed"], crash["closing_speed"])
-    return (crash["kind"], *crash["vehicles"], *speeds, *crash["delta_v"], *crash["injury_risk"])
 
 
 def write_failures(

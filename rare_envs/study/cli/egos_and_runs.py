@@ -100,7 +100,7 @@ def train_ego_command(
         algo = algo or "ppo"
         world = {**asked, **{name: asked[name] or USUAL[name] for name in ("observation", "action")}}
     more |= {} if device == "cpu" else {"device": device}
-    more |= {"trust": True} if trust else {}
+    world |= {"trust": True} if trust else {}
     settings: dict[str, Any] = {
         "seed": seed,
         "num_envs": num_envs,
@@ -111,6 +111,7 @@ def train_ego_command(
     with as_bad_input(ValueError, OSError):
         path = train_ego(ids, algo, steps, out=out, **settings, **more, **world)
     of_run = {"ego": str(path), "env_id": ids[0] if len(ids) == 1 else ids, "algo": algo, "steps": steps, "seed": seed}
+    world.pop("trust", None)
     data = {**of_run, **world, "even_strata": even_strata, **data}
     if HYPERPARAMETERS[algo].discrete and asked["action"] is None:
         world["action"] = "discrete"  # which is what the algorithm made of it

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
-from rare_envs.scenarios.registry import complete_id, find_scenario, is_highway_env_id
+from rare_envs.scenarios.registry import SCENARIOS, complete_id, find_scenario, is_highway_env_id
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, find_method, read_mapping
 from rare_envs.study.cli import options
 from rare_envs.study.cli.options import command
@@ -296,6 +296,10 @@ def compare_command(
     details: options.DetailsOption = False,
 ) -> Answer:
     """Estimate how many times likelier ego A fails than ego B, in a scenario or summed over those of risk."""
+    if scenario := next((name for name in (ego_a, ego_b) if complete_id(name) in SCENARIOS), ""):
+        raise BadInput(
+            f"Expected two egos before the scenario {scenario}: rare-envs compare old.zip new.zip {scenario}."
+        )
     asked["max_sim"] = asked["max_sim"] or PAIR_SIMULATIONS
     how: dict[str, Any] = {"out": out, "progress": True, "force": force, "executor": executor}
     how |= {"algo_b": algo_b, "stats_b": stats_b}

@@ -79,10 +79,9 @@ KINDS = ("environments", "bases", *TITLES, "weather", EVERYTHING)
 
 def list_names() -> dict[str, Any]:
     """Return everything that can be named on the command line, as JSON-ready values."""
-    environments = {env_id: _describe_environment(env_id, scenario) for env_id, scenario in SCENARIOS.items()}
     measures = {name: each.of if isinstance(each, Measure | TraceMeasure) else each for name, each in MEASURES.items()}
     return {
-        "environments": environments,
+        "environments": {env_id: _describe_environment(env_id, scenario) for env_id, scenario in SCENARIOS.items()},
         "highway_env": list(HIGHWAY_ENV_IDS),
         "weather": [_describe(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
         "methods": {name: _first_line(method) for name, method in samplers.methods.METHODS.items()},
@@ -107,8 +106,8 @@ def _describe_environment(env_id: str, scenario: Scenario) -> dict[str, Any]:
 
 def _describe(parameter: Parameter) -> dict[str, Any]:
     """Return a parameter as JSON-ready values; None for an end of its range that there is not."""
-    ends = {"low": parameter.low, "high": parameter.high}
-    return asdict(parameter) | {name: end if math.isfinite(end) else None for name, end in ends.items()}
+    values = asdict(parameter)
+    return values | {end: values[end] if math.isfinite(values[end]) else None for end in ("low", "high")}
 
 
 def _first_line(documented: object) -> str:
@@ -143,18 +142,15 @@ def choose_entries(entries: dict[str, Any], what: str) -> dict[str, Any]:
     if what == EVERYTHING:
         return entries
     if what == "bases":
-        return {"bases": {env_id: list_bases(env_id) for env_id in entries["environments"]}}
+        return {"bases": {env_id: list_bases(scenario) for env_id, scenario in SCENARIOS.items()}}
     if what in KINDS:
-        return {
-            kind: entries[kind] for kind in (("environments", "highway_env") if what == "environments" else (what,))
-        }
+        return {kind: entries[kind] for kind in ((what, "highway_env") if what == "environments" else (what,))}
     env_id = split_layout(complete_id(what))[0]
-    if env_id not in entries["environments"] and ":" not in env_id:
-        hint = did_you_mean(what, [*KINDS, *entries["environments"], *(each.name for each in SCENARIOS.values())])
+    if env_id not in SCENARIOS and ":" not in env_id:
+        hint = did_you_mean(what, [*KINDS, *SCENARIOS, *(each.name for each in SCENARIOS.values())])
         raise BadInput(f"Expected {', '.join(KINDS)} or a scenario, such as CutIn, got {what!r}{hint}.")
-    scenario = find_scenario(env_id)
-    own = env_id.rpartition(":")[2]
-    return {"environments": {own: _describe_environment(own, scenario)}, "bases": {own: list_bases(env_id)}}
+    scenario, own = find_scenario(env_id), env_id.rpartition(":")[2]
+    return {"environments": {own: _describe_environment(own, scenario)}, "bases": {own: list_bases(scenario)}}
 
 
 def print_details(chosen: dict[str, Any]) -> None:
@@ -171,17 +167,20 @@ def print_details(chosen: dict[str, Any]) -> None:
             f"with HighwayEnv's observations and actions: {environment['kinematics_id']}\n",
         ):
             console.print(f"  {text}")
+    unbroken = CleanConsole(highlight=False, soft_wrap=True, markup=False)
     for env_id, bases in chosen.get("bases", {}).items():
-        print_bases(env_id, bases)
+        unbroken.print(f"Traffic models of {env_id}", style="bold")
+        for number, (name, base) in enumerate(bases.items()):
+            unbroken.print(f"{name}{' (default)' if number == 0 else ''}", style="bold")
+            facts = [(f"  {title}", text) for title, text in _summarise(base).items() if text]
+            unbroken.print("\n".join(fold_rows(facts, len(facts) * MOST_LINES)))
+        unbroken.print()
     if "highway_env" in chosen:
         own = "HighwayEnv's own, for estimate, and with its settings for rare_envs.highway_env_problem in Python: "
         console.print(f"{own}{', '.join(chosen['highway_env'])}\n")
     if "weather" in chosen:
-        _print_parameters(
-            console,
-            "Weather for egos with a camera (weather: true in a file for --config)",
-            chosen["weather"],
-        )
+        title = "Weather for egos with a camera (weather: true in a file for --config)"
+        _print_parameters(console, title, chosen["weather"])
     for kind in (kind for kind in TITLES if kind in chosen):
         _print_table(console, TITLES[kind], ["name", "what it is"], chosen[kind].items())
 
@@ -203,25 +202,13 @@ def _print_table(console: Console, title: str, heads: list[str], rows: Iterable[
     console.print(table)
 
 
-def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
-    """Return the traffic models of a scenario by name, the default first."""
-    found = find_scenario(scenario)
-    return {name: _describe_base(found, name) for name in found.bases}
-
-
-def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print what `list_bases` returns for a scenario, a few facts each, in lines of less than a hundred columns."""
-    console = CleanConsole(highlight=False, soft_wrap=True, markup=False)
-    console.print(f"Traffic models of {env_id}", style="bold")
-    for number, (name, base) in enumerate(bases.items()):
-        console.print(f"{name}{' (default)' if number == 0 else ''}", style="bold")
-        facts = [(f"  {title}", text) for title, text in _summarise(base).items() if text]
-        console.print("\n".join(fold_rows(facts, len(facts) * MOST_LINES)))
-    console.print()
+def list_bases(scenario: Scenario) -> dict[str, dict[str, Any]]:
+    """Return the traffic models of a scenario by name, the default first; None and empty where nothing is known."""
+    return {name: _describe_base(scenario, name) for name in scenario.bases}
 
 
 def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
-    """Return what is known of a base distribution, JSON-ready; None and empty where nothing is."""
+    """Return what is known of a traffic model, JSON-ready."""
     base, file = load_base(scenario, name), scenario.bases[name]
     content = json.loads(file.read_text(encoding="utf-8")) if hasattr(file, "read_text") else file
     record = content.get("provenance") if isinstance(content, Mapping) else None
@@ -229,27 +216,21 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
     known: dict[str, Any] = {
         "kind": record.get("kind"),
         **{key: text or None for key, text in read_source(record).items()},
-        **{key: record.get(key) for key in ("coordinates", "bic", "held_out_log_prob")},
+        **{key: record.get(key) for key in ("coordinates", "bic", "held_out_log_prob", "checked_against")},
         **dict.fromkeys(("fitted_to", "events", "family", "frequency")),
         "refits": 0,
         "no_frequency": explain_no_frequency(record),
         "checks": record.get("checks", []),
-        "checked_against": record.get("checked_against"),
         "motion": record.get("motion", {}),
     }
-    if not isinstance(base, FittedDistribution):
-        return known
-    frequency = base.frequency
-    if frequency is not None:
-        rates = {"per_hour": frequency.per_hour, "per_km": frequency.per_km}
-        known |= {"frequency": {**asdict(frequency), **rates}, "no_frequency": None}
-    return known | {
-        "fitted_to": base.fitted_to,
-        "events": asdict(base.events),
-        "family": base.family,
-        "refits": len(base.refits),
-        "checks": [{key: getattr(check, key) for key in ("name", "recorded", "expected")} for check in base.checks],
-    }
+    if isinstance(base, FittedDistribution):
+        checks = [{key: getattr(check, key) for key in ("name", "recorded", "expected")} for check in base.checks]
+        known |= {"fitted_to": base.fitted_to, "events": asdict(base.events), "family": base.family}
+        known |= {"refits": len(base.refits), "checks": checks}
+        if (counted := base.frequency) is not None:
+            rates = {"per_hour": counted.per_hour, "per_km": counted.per_km}
+            known |= {"frequency": {**asdict(counted), **rates}, "no_frequency": None}
+    return known
 
 
 def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
