@@ -147,8 +147,8 @@ def estimate_highway_env(
     if not vehicles.startswith("highway_env.") and not question.trust:
         raise BadInput(f"The file of env_config names code, {vehicles!r}: let it run by --trust.")
     file = None if out is None else out / ESTIMATE_FILE
-    if file is not None and file.exists() and not force:
-        raise BadInput(f"There is a finished run in {str(out)!r} ({ESTIMATE_FILE}): replace it by --force.")
+    if out is not None and not force:
+        writing.check_no_results(out, ESTIMATE_FILE)
     with as_bad_input(ValueError, OSError, TypeError):
         method, arguments = find_method(question.method), asdict(question.run_arguments)
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)

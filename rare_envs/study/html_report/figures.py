@@ -7,7 +7,6 @@ import io
 import math
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,29 +95,6 @@ def draw_band(
         axes.legend(frameon=False)
 
 
-def draw_parameters(
-    figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str]
-) -> None:
-    """Draw each of k parameters in ordinary traffic (n, k) and among failures (m, k) with weights (m,)."""
-    rows = math.ceil(len(labels) / PANELS)
-    panels = np.atleast_1d(figure.subplots(rows, min(PANELS, len(labels)), squeeze=False)).ravel()
-    for j, axes in enumerate(panels):
-        if j >= len(labels):
-            axes.set_axis_off()
-            continue
-        ends = np.quantile(ordinary[:, j], [0.002, 0.998]), np.quantile(failing[:, j], [0.002, 0.998])
-        low, high = float(np.min(ends)), float(np.max(ends))
-        bins = np.linspace(low, high, 30) if high > low else np.array([low - 0.5, low + 0.5])
-        usual: dict[str, Any] = {"color": ORDINARY_COLOUR, "label": "ordinary traffic"}
-        failures: dict[str, Any] = {"color": HIT_COLOUR, "label": "failures", "histtype": "step", "linewidth": 1.5}
-        axes.hist(ordinary[:, j], bins=bins, density=True, **usual)
-        axes.hist(failing[:, j], bins=bins, density=True, weights=weights, **failures)
-        axes.set(xlabel=labels[j].replace("_", " "), yticks=[])
-        axes.spines["left"].set_visible(False)
-    lines, words = panels[0].get_legend_handles_labels()
-    figure.legend(lines, words, loc="outside upper right", ncols=2, frameon=False)
-
-
 def figures_of_result(result: Result, measure: str, prefix: str = "") -> dict[str, FigureOfPage]:
     """Return the figures that the numbers of a run allow, by name; `prefix` stands before it in files and ids."""
     curve, severity = result.get("curve"), result.get("severity")
@@ -137,8 +113,23 @@ def figures_of_result(result: Result, measure: str, prefix: str = "") -> dict[st
 def figure_of_parameters(
     ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str], prefix: str = ""
 ) -> FigureOfPage:
-    """Return the figure of `draw_parameters`."""
-    size = (4.4, 0.4 + 1.9 * math.ceil(len(labels) / PANELS))
+    """Return a figure of each of k parameters in ordinary traffic (n, k) and among failures (m, k), weights (m,)."""
+    rows = math.ceil(len(labels) / PANELS)
+
+    def draw(figure: Figure) -> None:
+        panels = np.atleast_1d(figure.subplots(rows, min(PANELS, len(labels)), squeeze=False)).ravel()
+        for axes in panels[len(labels) :]:
+            axes.set_axis_off()
+        for label, axes, usual, failed in zip(labels, panels, ordinary.T, failing.T, strict=False):
+            ends = [np.quantile(values, [0.002, 0.998]) for values in (usual, failed)]
+            low, high = float(np.min(ends)), float(np.max(ends))
+            bins = np.linspace(low, high, 30) if high > low else np.array([low - 0.5, low + 0.5])
+            step: dict[str, Any] = {"label": "failures", "histtype": "step", "linewidth": 1.5, "weights": weights}
+            axes.hist(usual, bins=bins, density=True, color=ORDINARY_COLOUR, label="ordinary traffic")
+            axes.hist(failed, bins=bins, density=True, color=HIT_COLOUR, **step)
+            axes.set(xlabel=label.replace("_", " "), yticks=[])
+            axes.spines["left"].set_visible(False)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
+
     caption = "Parameters in ordinary traffic and among failures, the most shifted first"
-    draw = partial(draw_parameters, ordinary=ordinary, failing=failing, weights=weights, labels=labels)
-    return FigureOfPage(f"{prefix}parameters", caption, draw, size)
+    return FigureOfPage(f"{prefix}parameters", caption, draw, (PANEL_SIZE[0], 0.4 + 1.9 * rows))

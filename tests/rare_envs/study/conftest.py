@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "broken.json").write_text('{"names": [')
     (tmp_path / "a_file").write_text("mine")
     return tmp_path
+
+
+@pytest.fixture
+def run(finished_run: Path, here: Path) -> Path:
+    """A copy of that run in the working directory."""
+    shutil.copytree(finished_run, here / "run")
+    return Path("run")
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -57,11 +56,6 @@ def test_a_file_that_is_not_what_was_stored_is_refused() -> None:
         with pytest.raises(ValueError, match="the file") as caught:
             parse_stored(other, "the file")
         assert "\n" not in str(caught.value)
-
-
-@pytest.fixture
-def run(finished_run: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def test_failures_of_a_run_are_added_once(run: Path, tmp_path: Path) -> None:

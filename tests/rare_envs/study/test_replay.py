@@ -153,18 +153,8 @@ def test_a_film_of_every_scenario_without_a_crash(env_id: str, tmp_path: Path) -
 
 
 def test_sensitivity_is_shown_and_written(cli: Cli, tmp_path: Path) -> None:
-    words = (
-        "estimate",
-        FOLLOWING,
-        "--base",
-        "us101-gap",
-        "--max-sim",
-        2000,
-        *in_file(sensitivity=True),
-        "--out",
-        tmp_path,
-    )
-    shown = cli(*words)
+    words = ("--base", "us101-gap", "--max-sim", 2000, *in_file(sensitivity=True), "--out", tmp_path)
+    shown = cli("estimate", FOLLOWING, *words)
     assert shown.exit_code in (0, 3) and "importance (relative entropy of u_j given failure" in shown.stdout
     saved = json.loads((tmp_path / "result.json").read_text())["sensitivity"]
     assert {each["name"] for each in saved["columns"]} == {"ego_speed", "lead_speed", "gap"}

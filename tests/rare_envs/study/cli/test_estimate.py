@@ -102,13 +102,10 @@ def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: s
     assert (here / "old").exists()
 
 
-def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
+def test_weather_on_the_command_line(cli: Cli) -> None:
     words = ("estimate", "rare_envs/CutIn-v0", "--observation", "camera+lidar", "--method", "mc")
-    found = json.loads(
-        cli(*words, "--max-sim", 40, *in_file(weather=True, horizon=1), "--out", tmp_path / "run", "--json").stdout
-    )
-    assert found["question"]["weather"] is True
-    assert found["question"]["observation"] == "camera+lidar"
+    found = json.loads(cli(*words, "--max-sim", 40, *in_file(weather=True, horizon=1), "--json").stdout)["question"]
+    assert found["weather"] is True and found["observation"] == "camera+lidar"
 
 
 def test_a_plan_from_pilots_and_one_from_a_folder(
@@ -227,17 +224,8 @@ def test_one_file_of_settings_serves_all_three(cli: Cli, risky: str) -> None:
 
 @pytest.mark.slow
 def test_an_estimate_in_highway_env_is_resumed(cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = (
-        "estimate",
-        "highway-fast-v0",
-        "--ego",
-        "egos_here:idle",
-        "--method",
-        "ss",
-        "--max-sim",
-        150,
-        *in_file(horizon=1),
-    )
+    words = "estimate highway-fast-v0 --ego egos_here:idle --method ss --max-sim 150".split()
+    words += in_file(horizon=1)
     whole = json.loads(cli(*words, "--json").stdout)
     evaluate, made = HighwayEnvProblem.evaluate, [0]
 
@@ -307,18 +295,8 @@ def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
 @pytest.mark.usefixtures("full_pictures")
 def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""
-    words = "--measure lidar_ttc --gamma 1 --ego mgail --drivers gail --method mc".split()
-    result = cli(
-        "estimate",
-        "rare_envs/Highway-v0",
-        *words,
-        *in_file(horizon=2, noise="fixed"),
-        "--max-sim",
-        256,
-        "--details",
-        "--out",
-        tmp_path,
-    )
+    words = "Highway-v0 --measure lidar_ttc --gamma 1 --ego mgail --drivers gail --method mc --max-sim 256".split()
+    result = cli("estimate", *words, *in_file(horizon=2, noise="fixed"), "--details", "--out", tmp_path)
     assert result.exit_code in (0, 3), result.output
     assert "the drivers' noise is one fixed sequence" in result.stdout
     assert max(map(len, result.stdout.splitlines())) < 200
