@@ -1,4 +1,4 @@
-"""Small questions on the command line, and refusals of bad input."""
+"""Small questions on the command line, refusals of bad input, and what comes in the way of a run."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 from typer.testing import Result
+
+from rare_envs.problem import DrivingProblem
 
 Cli = Callable[..., Result]
 FOLLOWING = "rare_envs/CarFollowing-v0"
@@ -36,3 +39,26 @@ def assert_refused(result: Result, *words: str) -> None:
     for word in words:
         assert word in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def full_disk(*_: Any, **__: Any) -> Any:
+    raise OSError(28, "No space left on device")
+
+
+def act_after(
+    rows: int, act: Callable[[], Any], patch: pytest.MonkeyPatch, owner: Any = DrivingProblem, name: str = "attempt"
+) -> None:
+    """Act each time that more than some rows have been simulated, before they are."""
+    simulate, made = getattr(owner, name), [0]
+
+    def acting(self: Any, x: Any) -> Any:
+        made[0] += len(x)
+        if made[0] > rows:
+            act()
+        return simulate(self, x)
+
+    patch.setattr(owner, name, acting)
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt

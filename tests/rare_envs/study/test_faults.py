@@ -23,6 +23,7 @@ from rare_envs.study.report import Report
 from rare_envs.study.run_folder import JOURNAL
 from samplers.evaluate import Evaluator
 from samplers.run import Progress
+from tests.rare_envs.study.refusals import act_after, interrupt
 
 ENV = "rare_envs/CarFollowing-v0"
 GAP = 30.0
@@ -324,16 +325,8 @@ def test_what_one_executor_began_another_continues(
     monkeypatch.setattr(DrivingProblem, "tile", 50)
     monkeypatch.setattr(DrivingProblem, "chunk_size", 30)
     whole = evaluate.run(prepare(ask("nan", risky, chunk=chunk)))
-    attempt, rows = DrivingProblem.attempt, [0]
-
-    def interrupted(self: DrivingProblem, x: Any) -> Any:
-        rows[0] += len(x)
-        if rows[0] > 230:
-            raise KeyboardInterrupt
-        return attempt(self, x)
-
     with monkeypatch.context() as patch:
-        patch.setattr(DrivingProblem, "attempt", interrupted)
+        act_after(230, interrupt, patch)
         with pytest.raises(evaluate.RunInterrupted, match="200 simulations are kept"):
             evaluate.run_into(faulty / "run", prepare(ask("nan", risky, chunk=chunk)))
     assert (faulty / "run" / JOURNAL).exists()

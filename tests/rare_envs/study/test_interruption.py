@@ -18,21 +18,9 @@ from rare_envs.study import evaluate, question, writing
 from samplers import estimation
 from samplers.journal import Journal
 from tests.rare_envs.study.fitted_files import write_fitted
-from tests.rare_envs.study.refusals import FOLLOWING, Cli, in_file
+from tests.rare_envs.study.refusals import FOLLOWING, Cli, act_after, full_disk, in_file
 
-WORDS = (
-    "estimate",
-    FOLLOWING,
-    "--method",
-    "mc",
-    *in_file(horizon=1),
-    "--gamma",
-    "2",
-    "--max-sim",
-    "600",
-    "--seed",
-    "0",
-)
+WORDS = (*f"estimate {FOLLOWING} --method mc --gamma 2".split(), *in_file(horizon=1), "--max-sim", "600", "--seed", "0")
 NOTHING = "Stopped: no estimate yet, no simulation made."
 LOST = "With --out finished simulations would have been kept."
 
@@ -49,19 +37,6 @@ def small_tiles_and_heeded_hangups(monkeypatch: pytest.MonkeyPatch) -> Iterator[
 def stop(name: str = "SIGTERM") -> None:
     """Send this process a signal, which is handled before the next line."""
     os.kill(os.getpid(), getattr(signal, name))
-
-
-def stop_after(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Send a signal when more than some rows have been simulated."""
-    attempt, made = DrivingProblem.attempt, [0]
-
-    def stopping(self: DrivingProblem, x: Any) -> Any:
-        made[0] += len(x)
-        if made[0] > rows:
-            stop()
-        return attempt(self, x)
-
-    monkeypatch.setattr(DrivingProblem, "attempt", stopping)
 
 
 def assert_stopped(result: Any, line: str, name: str = "SIGTERM") -> None:
@@ -84,11 +59,11 @@ def test_in_the_first_batch_simulations_are_counted_and_later_p_so_far_is_the_fi
     n_failed = json.loads(cli(*WORDS, "--max-sim", "400", "--base", risky, "--json").stdout)["n_failures"]
     assert 0 < n_failed < 400
     with monkeypatch.context() as patch:
-        stop_after(400, patch)
+        act_after(400, stop, patch)
         result = cli(*WORDS, "--base", risky)
     assert_stopped(result, f"Stopped: no estimate yet, 400 simulations made, {n_failed} of them failed. {LOST}")
     assert result.stdout == ""
-    stop_after(10_000, monkeypatch)
+    act_after(10_000, stop, monkeypatch)
     result = cli(*WORDS, "--max-sim", "30000", "--base", risky, "--json")
     found = json.loads(result.stdout)
     assert (found["n_sim"], found["status"]) == (10_000, "stopped")
@@ -120,11 +95,8 @@ def test_after_the_last_simulation_the_answer_is_printed_and_kept(
 def test_simulations_of_the_further_run_are_not_those_of_the_run(
     cli: Cli, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(estimation, "needs_ensemble_run", lambda *_: True)
-    monkeypatch.setattr(writing, "write_run", full)
+    monkeypatch.setattr(writing, "write_run", full_disk)
     result = cli(*WORDS, "--base", write_fitted(here / "base.json", "car_following"), "--out", "run", "--json")
     assert json.loads(result.stdout)["n_sim"] == 600
     kept = "600 simulations and a further 600 under the mixture of the refits are kept; go on with: "
@@ -134,7 +106,7 @@ def test_simulations_of_the_further_run_are_not_those_of_the_run(
 def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("compare", "egos_here:coasting", "idm", *WORDS[1:-4], "--base", risky, "--max-sim", "60000")
     with monkeypatch.context() as patch:
-        stop_after(25_000, patch)
+        act_after(25_000, stop, patch)
         result = cli(*words, "--out", "both")
     assert result.exit_code == 143
     assert result.stderr.startswith("Stopped after 10,000 simulations: P[A or B fails] so far ")
@@ -142,7 +114,7 @@ def test_a_comparison_says_what_is_known(cli: Cli, here: Path, risky: str, monke
     both = json.loads(cli("resume", "both", "--workers", 1, "--json").stdout)
     assert both == json.loads(cli(*words, "--out", "whole", "--json").stdout)
     assert sorted(path.name for path in Path("both").iterdir()) == ["comparison.json", "failures.csv"]
-    stop_after(300, monkeypatch)
+    act_after(300, stop, monkeypatch)
     assert_stopped(cli(*words), "Stopped: no estimate yet, the first batch of simulations was not complete.")
 
 
@@ -152,7 +124,7 @@ def test_a_sum_of_comparisons_goes_on_in_the_scenario_that_was_stopped(
 ) -> None:
     words = ("compare", "idm", "cc_human", "--method", "mc", "--max-sim", "20000", "--seed", "0", "--max-ratio", "2")
     with monkeypatch.context() as patch:
-        stop_after(30_000, patch)
+        act_after(30_000, stop, patch)
         result = cli(*words, "--out", "both")
     assert result.exit_code == 143
     assert "simulations are kept; go on with: rare-envs resume both\n" in result.stderr
@@ -177,7 +149,7 @@ def test_a_full_disk_in_mid_run_counts_each_simulation_once(
         insert(self, row)
 
     monkeypatch.setattr(Journal, "_insert", full_for_the_first)
-    stop_after(400, monkeypatch)
+    act_after(400, stop, monkeypatch)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         result = cli(*WORDS, "--base", risky, "--out", "run")

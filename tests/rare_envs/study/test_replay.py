@@ -26,7 +26,7 @@ from rare_envs.study.plots import (
     write_film,
 )
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, full_disk, in_file
 
 CUT_IN, NEWEST = "rare_envs/CutIn-v0", "rare_envs/CutIn-v1"
 
@@ -73,12 +73,9 @@ def test_moments_by_hand() -> None:
 def test_a_film_on_a_full_disk_is_one_line_and_the_film_before_it_stays(
     cli: Cli, finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
     film = tmp_path / "film.gif"
     film.write_text("the one before")
-    monkeypatch.setattr(plots, "save_gif", full)
+    monkeypatch.setattr(plots, "save_gif", full_disk)
     assert_refused(cli("replay", finished_run, "--out", film, "--force"), "No space left on device", str(film))
     assert film.read_text() == "the one before" and list(tmp_path.iterdir()) == [film]
 

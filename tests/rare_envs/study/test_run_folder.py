@@ -21,7 +21,7 @@ from rare_envs.study.episodes import EpisodeTable, digest_scenarios, name_column
 from rare_envs.study.evaluate import resume
 from samplers.evaluate import Simulated
 from samplers.journal import Journal
-from tests.rare_envs.study.refusals import FOLLOWING
+from tests.rare_envs.study.refusals import FOLLOWING, full_disk
 
 
 def test_loading_takes_neither_torch_nor_the_simulation(finished_run: Path) -> None:
@@ -174,10 +174,7 @@ def test_faults_have_their_reason_and_count_as_failures(here: Path, risky: str, 
 def test_a_table_that_cannot_be_written_does_not_end_the_run(
     risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(episodes, "_join_batches", refuse)
+    monkeypatch.setattr(episodes, "_join_batches", full_disk)
     with pytest.raises(UnwrittenResults, match="300 simulations are kept; go on with: rare-envs resume") as stopped:
         run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=300)))
     report = stopped.value.report

@@ -33,7 +33,7 @@ from samplers.journal import COLUMNS, Journal, _Row
 from samplers.workers import ExecutorError
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, full_disk, in_file
 from tests.samplers.real_executors import case
 
 FRAIL = """
@@ -303,22 +303,18 @@ def test_a_remote_ego_that_is_killed_for_good_and_started_later(
 # The disk and the folder
 
 
-def full(*_: Any, **__: Any) -> Any:
-    raise OSError(28, "No space left on device")
-
-
 def test_a_full_disk_is_one_line_at_the_start_and_at_the_end_costs_nothing(
     cli: Cli, frail: Path, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(journals, "_connect", full)
+        patch.setattr(journals, "_connect", full_disk)
         assert_refused(cli(*SMALL, "--out", frail / "new" / "run"), "Cannot write", "No space left on device")
     words = (*SMALL[:-1], 600, "--base", risky, "--json", "--out")
     whole = cli(*words, "whole")
     table = load_study("whole").episodes().drop_columns(["seconds"])
     for owner, name, said in ((writing, "write_run", "Cannot write the results"), (pq, "ParquetWriter", EPISODES)):
         with monkeypatch.context() as patch:
-            patch.setattr(owner, name, full)
+            patch.setattr(owner, name, full_disk)
             ended = cli(*words, "run", "--force")
         assert ended.exit_code == 2
         assert json.loads(ended.stdout)["p"] == json.loads(whole.stdout)["p"] > 0

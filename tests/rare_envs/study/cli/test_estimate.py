@@ -26,7 +26,7 @@ from rare_envs.study.cli.app import EXAMPLES, app, list_examples
 from rare_envs.study.cli.estimate import ESTIMATE_FILE
 from rare_envs.study.run_folder import CRASH, read_failures
 from samplers.executors import LocalProcesses
-from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, act_after, assert_refused, in_file, interrupt
 
 
 def test_a_doubtful_number_says_so_and_exits_with_3(cli: Cli, safe: str) -> None:
@@ -227,16 +227,8 @@ def test_an_estimate_in_highway_env_is_resumed(cli: Cli, here: Path, monkeypatch
     words = "estimate highway-fast-v0 --ego egos_here:idle --method ss --max-sim 150".split()
     words += in_file(horizon=1)
     whole = json.loads(cli(*words, "--json").stdout)
-    evaluate, made = HighwayEnvProblem.evaluate, [0]
-
-    def stopping(self: HighwayEnvProblem, x: Any) -> Any:
-        made[0] += len(x)
-        if made[0] > 100:
-            raise KeyboardInterrupt
-        return evaluate(self, x)
-
     with monkeypatch.context() as patch:
-        patch.setattr(HighwayEnvProblem, "evaluate", stopping)
+        act_after(100, interrupt, patch, HighwayEnvProblem, "evaluate")
         assert "go on with: rare-envs resume run\n" in cli(*words, "--out", "run").stderr
     assert json.loads(cli("resume", "run", "--json").stdout)["p"] == whole["p"]
 
