@@ -89,7 +89,10 @@ def test_p_is_the_sum_of_the_weights_of_the_failures(risky: str, tmp_path: Path,
     assert set(table["run"]) == set(range(replicates))
 
 
-def test_a_row_has_the_scenario_its_f_and_its_crash(risky: str, tmp_path: Path) -> None:
+def test_a_row_has_the_scenario_its_f_and_its_crash_and_row_groups_are_bounded(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(episodes, "ROWS_AT_ONCE", 128)
     report = run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=400)))
     study = rare_envs.load_study(tmp_path / "run")
     table = study.episodes()
@@ -104,6 +107,9 @@ def test_a_row_has_the_scenario_its_f_and_its_crash(risky: str, tmp_path: Path) 
     assert (table["seconds"].to_numpy() > 0).all() and table["error"].null_count == 400
     listed = {tuple(row) for row in np.column_stack([study.failures[name] for name in problem.space.names])}
     assert listed <= {tuple(row) for row in x}
+    file = pq.ParquetFile(study.episodes_path)
+    assert max(file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)) <= 128
+    assert file.schema_arrow.metadata[b"rare_envs.format"] == b"1"
 
 
 def test_a_resumed_run_tells_the_time_before(risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,16 +152,6 @@ def test_large_blocks_are_lists_in_single_precision(tmp_path: Path, monkeypatch:
     np.testing.assert_array_equal(values, space.columns(x)["weights"].astype(np.float32))
     rows = [episodes._as_array(found[name].combine_chunks()) for name in kinds]
     assert digest_scenarios(np.hstack(rows)) == digest_scenarios(x)
-
-
-def test_row_groups_are_bounded_and_the_schema_says_its_version(
-    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(episodes, "ROWS_AT_ONCE", 128)
-    run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=500)))
-    file = pq.ParquetFile(tmp_path / "run" / "episodes.parquet")
-    assert max(file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)) <= 128
-    assert file.schema_arrow.metadata[b"rare_envs.format"] == b"1"
 
 
 @pytest.mark.parametrize("on_error", ["failure", "bound"])

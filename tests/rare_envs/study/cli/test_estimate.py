@@ -67,11 +67,11 @@ def test_the_answer_is_short_unless_details_are_asked_for(cli: Cli, risky: str, 
     assert json.loads((tmp_path / "a b" / "result.json").read_text())["text"] == lines[:-1]
 
 
-def test_what_is_unusual_in_the_most_likely_failure_is_named(cli: Cli, risky: str, tmp_path: Path) -> None:
-    cli(*SMALL, "--base", risky, "--out", tmp_path)
-    shown = " ".join(" ".join(json.loads((tmp_path / "result.json").read_text())["text"]).split())
+def test_what_is_unusual_in_the_most_likely_failure_is_named(finished_run: Path) -> None:
+    result = json.loads((finished_run / "result.json").read_text())
+    shown = " ".join(" ".join(result["text"]).split())
     named = re.findall(r"(ego at|lead at|gap) (-?[\d.]+) (?:m|m/s) \(usually (-?[\d.]+) to (-?[\d.]+)\)", shown)
-    failure = json.loads((tmp_path / "result.json").read_text())["failures"][0]["parameters"]
+    failure = result["failures"][0]["parameters"]
     for words, value, low, high in named:
         name = {"ego at": "ego_speed", "lead at": "lead_speed"}.get(words, words)
         assert float(value) == pytest.approx(failure[name], rel=0.05)
