@@ -1,8 +1,8 @@
 """`rare-envs check-ego`: does an ego fit, before simulations are spent on it?
 
 The ego is loaded and asked in a process of its own, which may hang or die without ending the check. Its checks are
-functions from a `Probe` to findings; `EGO_CHECKS` has all of them by name. A server is held against the protocol of
-docs/egos.md over its socket, message by message.
+functions from a `Probe` to findings, named by what they check; `EGO_CHECKS` has all of them. A server is held against
+the protocol of docs/egos.md over its socket, message by message.
 """
 
 from __future__ import annotations
@@ -207,10 +207,10 @@ def run_checks(question: Question) -> Iterator[Finding | str]:
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield Finding("loading", "fail", reason_of(error), "see docs/egos.md for what an ego is")
         return
-    for name in EGO_CHECKS if probe.policy is not None else ("driving",):
-        yield name
+    for check in EGO_CHECKS if probe.policy is not None else (check_driving,):
+        yield (name := check.__name__.removeprefix("check_").replace("_", " "))
         try:
-            yield from EGO_CHECKS[name](probe)
+            yield from check(probe)
         except (Exception, SystemExit, EgoGone) as error:  # likewise
             gone = isinstance(error, EgoGone)
             yield Finding(name, "fail", reason_of(error), "start it again" if gone else "the ego failed in this check")
@@ -501,18 +501,10 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
     yield judge("driving", crashed > MANY_COLLISIONS and result, result, advice)
 
 
-EGO_CHECKS: dict[str, Callable[[Probe], Iterator[Finding]]] = {
-    "declared spaces": check_declared_spaces,
-    "normalisation": check_normalisation,
-    "actions": check_actions,
-    "determinism": check_determinism,
-    "memory": check_memory,
-    "row independence": check_row_independence,
-    "extreme observations": check_extreme_observations,
-    "driving": check_driving,
-    "latency": check_latency,
-    "memory growth": check_memory_growth,
-}
+EGO_CHECKS = (
+    *(check_declared_spaces, check_normalisation, check_actions, check_determinism, check_memory),
+    *(check_row_independence, check_extreme_observations, check_driving, check_latency, check_memory_growth),
+)
 PROTOCOL_ADVICE = "docs/egos.md has the protocol"
 
 

@@ -131,13 +131,10 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Questio
     try:
         journal = Journal.open(path, mend)
     except FileNotFoundError as error:
-        why = f"it has no {run_folder.JOURNAL}. If the run was {begun}, {BEGIN_AGAIN}"
-        if (folder / run_folder.RESULT).is_file():
-            why = f"it has a finished one ({run_folder.RESULT})."
-        elif done := next((name for name in WHOLES if (folder / name).is_file()), ""):
+        there = f"it has no {run_folder.JOURNAL}" if folder.is_dir() else "the folder does not exist"
+        why = f"{there}. If the run was {begun}, {BEGIN_AGAIN}"
+        if done := next((name for name in (run_folder.RESULT, *WHOLES) if (folder / name).is_file()), ""):
             why = f"it has a finished one ({done})."
-        elif not folder.is_dir():
-            why = f"the folder does not exist. If the run was {begun}, {BEGIN_AGAIN}"
         raise BadInput(f"There is no unfinished run in {str(folder)!r}: {why}") from error
     except NothingRecorded as error:
         raise BadInput(f"The run in {str(folder)!r} was {begun}: {BEGIN_AGAIN}") from error
