@@ -26,7 +26,6 @@ from agents.learned.networks import (
     Policy,
     Scaling,
     WeightDistribution,
-    apply_heads,
     is_plain,
 )
 from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges, Seen
@@ -134,7 +133,9 @@ class LearnedDriver:
         if weights is None:
             output = policy.head(hidden).view(batch, vehicles, 2 * ACTION_SIZE)
         else:
-            output = apply_heads(hidden.view(batch, vehicles, HIDDEN_SIZES[-1]), weights.to(hidden.dtype).contiguous())
+            layer = weights.to(hidden.dtype).contiguous().view(batch, 2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
+            hidden = hidden.view(batch, vehicles, HIDDEN_SIZES[-1])
+            output = torch.baddbmm(layer[:, None, :, -1], hidden, layer[:, :, :-1].mT)
         normal, log_std = policy.split(output)
         swings = None
         if memory is not None:

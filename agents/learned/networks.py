@@ -114,12 +114,6 @@ def head_weights(policy: Policy) -> Tensor:
     return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
 
 
-def apply_heads(hidden: Tensor, weights: Tensor) -> Tensor:
-    """Return the outputs (B, M, 4) of hidden units (B, M, 100) by last layers of each scenario, weights (B, 404)."""
-    layer = weights.view(len(weights), 2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
-    return torch.baddbmm(layer[:, None, :, -1], hidden, layer[:, :, :-1].mT)
-
-
 def is_plain(policy: Policy) -> bool:
     """Return whether a network does what a `Policy` does: its class and layers, without hooks."""
     modules = policy, policy.first, policy.second, policy.head

@@ -237,11 +237,24 @@ def read_documents(
     The first of the arrays has the times, of which those `between` two are read. `vehicle` is the number of the
     document, from 1, as is the line of a row. A ValueError says what is wrong with the file.
     """
-    parts: list[dict[str, FloatArray]] = []
-    known: set[str] = set()
+    names, parts = {name: column.names[0] for name, column in columns.items()}, list[dict[str, FloatArray]]()
+    numbers, known = [name for name in columns if name not in arrays], set[str]()
     for number, document in enumerate(_documents(path), start=1):
         place = f"{path}, document {number}"
-        values = _read_fields(place, document, columns, arrays)
+        if missing := [name for name in ("_id", *names.values()) if name not in document]:
+            raise ValueError(f"{place} lacks {', '.join(missing)}; it has {', '.join(document)}.")
+        try:
+            values = {name: np.asarray(document[names[name]], dtype=np.float64) for name in arrays}
+            values |= {name: np.full(1, float(document[names[name]])) for name in numbers}
+        except (TypeError, ValueError):
+            one, many = (", ".join(names[name] for name in group) for group in (numbers, arrays))
+            raise ValueError(f"{place}: expected numbers in {one} and arrays of numbers in {many}.") from None
+        shapes = {names[name]: values[name].shape for name in arrays}
+        if len(set(shapes.values())) != 1 or (shape := next(iter(shapes.values()))) == (0,) or len(shape) != 1:
+            got = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise ValueError(f"{place}: expected arrays of one length, got {got}.")
+        if infinite := [names[name] for name, array in values.items() if not np.isfinite(array).all()]:
+            raise ValueError(f"{place}: {infinite[0]} has a value that is not finite.")
         name = str(document["_id"])
         if name in known:
             raise ValueError(f"{place}: _id {name} was given before.")
@@ -280,30 +293,6 @@ def _documents(path: Path) -> Iterator[Mapping[str, Any]]:
                 yield document
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
-
-
-def _read_fields(
-    place: str, document: Mapping[str, Any], columns: ColumnMap, arrays: Sequence[str]
-) -> dict[str, FloatArray]:
-    """Return the fields of a document, checked: numbers as arrays of one value."""
-    names = {name: column.names[0] for name, column in columns.items()}
-    if missing := [name for name in ("_id", *names.values()) if name not in document]:
-        raise ValueError(f"{place} lacks {', '.join(missing)}; it has {', '.join(document)}.")
-    numbers = [name for name in columns if name not in arrays]
-    try:
-        values = {name: np.asarray(document[names[name]], dtype=np.float64) for name in arrays}
-        values |= {name: np.full(1, float(document[names[name]])) for name in numbers}
-    except (TypeError, ValueError):
-        one, many = (", ".join(names[name] for name in group) for group in (numbers, arrays))
-        raise ValueError(f"{place}: expected numbers in {one} and arrays of numbers in {many}.") from None
-    shapes = [values[name].shape for name in arrays]
-    if len(set(shapes)) != 1 or len(shapes[0]) != 1 or shapes[0] == (0,):
-        got = ", ".join(f"{names[name]} {shape}" for name, shape in zip(arrays, shapes, strict=True))
-        raise ValueError(f"{place}: expected arrays of one length, got {got}.")
-    for name, array in values.items():
-        if not np.isfinite(array).all():
-            raise ValueError(f"{place}: {names[name]} has a value that is not finite.")
-    return values
 
 
 def check_tracks(

@@ -333,7 +333,15 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
         ValueError: Cannot read no_such_folder/01_recordingMeta.csv: ...
     """
     stem = f"{Path(folder) / recording}"
-    rate, (upper, lower) = _highd_recording(Path(f"{stem}_recordingMeta.csv"))
+    about = read_table(Path(f"{stem}_recordingMeta.csv"), HIGHD_RECORDING)
+    rate = float(about["rate"][0])
+    about.refuse(rate < 1.0 / DT, f"frameRate is {rate:g}, at least {1.0 / DT:g} Hz is needed.")
+    try:
+        upper, lower = (tuple(map(float, str(about[side][0]).split(";"))) for side in ("upper", "lower"))
+        wrong = any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in (upper, lower))
+    except ValueError:
+        wrong = True
+    about.refuse(wrong, "expected two lane markings or more on each side, increasing numbers separated by semicolons.")
     listed = read_table(Path(f"{stem}_tracksMeta.csv"), HIGHD_VEHICLES)
     listed.refuse(
         ~np.isin(listed["direction"], (1, 2)),
@@ -368,20 +376,6 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
         "leader": np.where(leader > 0, leader, NOBODY),
     }
     return tabulate(columns, {name: edges[name] for name in np.unique(names).tolist()})
-
-
-def _highd_recording(path: Path) -> tuple[float, list[tuple[float, ...]]]:
-    """Return the frame rate [Hz], and the lane markings [m] of the upper and of the lower lanes, top to bottom."""
-    rows = read_table(path, HIGHD_RECORDING)
-    rate = float(rows["rate"][0])
-    rows.refuse(rate < 1.0 / DT, f"frameRate is {rate:g}, at least {1.0 / DT:g} Hz is needed.")
-    try:
-        markings = [tuple(float(y) for y in str(rows[side][0]).split(";")) for side in ("upper", "lower")]
-        wrong = any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in markings)
-    except ValueError:
-        wrong = True
-    rows.refuse(wrong, "expected two lane markings or more on each side, increasing numbers separated by semicolons.")
-    return rate, markings
 
 
 def find_tgsim_files(path: Path | str) -> tuple[Path, ...]:

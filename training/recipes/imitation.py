@@ -128,30 +128,24 @@ def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> lis
         with torch.inference_mode():
             states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x))]
             tracks = torch.stack([torch.stack((s.x, s.y, s.heading, s.speed)) for s in states], dim=1).numpy()
-        for number, part in enumerate(np.split(tracks, kind.scenes, axis=2)):
-            name = f"{kind.scenario} {kind.base or ''} {number}"
-            scenes.append(_make_scene(name, world, part, -1.0 if number % 2 else 1.0))
+        for number, (x, y, heading, speed) in enumerate(np.split(tracks, kind.scenes, axis=2)):
+            side, shape = -1.0 if number % 2 else 1.0, (len(x), each * x.shape[2])
+            flat = {"x": x + APART * np.arange(each)[:, None], "y": side * y, "heading": side * heading, "speed": speed}
+            # vehicles without actions are replayed; the actions of the ego are not learned from, so zeros do
+            action = np.where(np.arange(shape[1]) % x.shape[2] == 0, 0.0, np.nan) * np.ones((len(x), 1))
+            scene = TrafficScene(
+                name=f"{kind.scenario} {kind.base or ''} {number}",
+                start=0.0,
+                edges=tuple(sorted(side * edge for edge in world.scenario.road.edges)),
+                **{key: values.reshape(shape) for key, values in flat.items()},
+                acceleration=action,
+                yaw_rate=action.copy(),
+                present=np.ones(shape, dtype=bool),
+                length=np.full(shape[1], VEHICLE_LENGTH),
+                width=np.full(shape[1], VEHICLE_WIDTH),
+            )
+            scenes.append(scene)
     return scenes
-
-
-def _make_scene(name: str, world: World, tracks: FloatArray, side: float) -> TrafficScene:
-    """Return one scene of n encounters with x, y, heading and speed (4, T, n, N), mirrored for side = -1."""
-    x, y, heading, speed = tracks
-    ticks, n, vehicles = x.shape
-    flat = {"x": x + APART * np.arange(n)[:, None], "y": side * y, "heading": side * heading, "speed": speed}
-    # vehicles without actions are replayed; the actions of the ego are not learned from, so zeros do
-    action = np.where(np.arange(n * vehicles) % vehicles == 0, 0.0, np.nan) * np.ones((ticks, 1))
-    return TrafficScene(
-        name=name,
-        start=0.0,
-        edges=tuple(sorted(side * edge for edge in world.scenario.road.edges)),
-        **{key: values.reshape(ticks, n * vehicles) for key, values in flat.items()},
-        acceleration=action,
-        yaw_rate=action.copy(),
-        present=np.ones((ticks, n * vehicles), dtype=bool),
-        length=np.full(n * vehicles, VEHICLE_LENGTH),
-        width=np.full(n * vehicles, VEHICLE_WIDTH),
-    )
 
 
 def prepare_learner(scenes: Sequence[TrafficScene], kinds: Sequence[EncounterSpec], config: Config) -> Learner:
