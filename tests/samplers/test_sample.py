@@ -1,3 +1,7 @@
+"""Weights and stages of single simulations, and their table."""
+
+import math
+
 import numpy as np
 import pytest
 
@@ -5,7 +9,9 @@ import samplers
 from samplers.problem import FloatArray
 
 
-def of_simulations(method: str, replicates: int, gamma: float) -> tuple[samplers.Estimate, FloatArray]:
+def of_simulations(
+    method: str, replicates: int, gamma: float, after: float = math.inf
+) -> tuple[samplers.Estimate, FloatArray]:
     f: list[FloatArray] = []
 
     def evaluate(x: FloatArray) -> FloatArray:
@@ -13,40 +19,33 @@ def of_simulations(method: str, replicates: int, gamma: float) -> tuple[samplers
         return f[-1]
 
     problem = samplers.FunctionProblem(evaluate, dim=4)
-    result = samplers.estimate(problem, method, gamma=gamma, seed=1, max_sim=3000, replicates=replicates)
+    result = samplers.estimate(
+        problem, method, gamma, 1, 3000, replicates=replicates, stop=lambda seen: seen.n_sim >= after
+    )
     return result, np.concatenate(f)
 
 
-@pytest.mark.parametrize(("replicates", "gamma"), [(1, 0.0), (2, 1.5)])
+@pytest.mark.parametrize(
+    ("replicates", "gamma", "after"), [(1, 0.0, math.inf), (2, 1.5, math.inf), (1, 0.0, 100), (1, 0.0, 1500)]
+)
 @pytest.mark.parametrize(
     "method", ["mc", "is", "ce", "ice", "two-stage", pytest.param("surrogate", marks=pytest.mark.slow)]
 )
-def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int, gamma: float) -> None:
-    result, f = of_simulations(method, replicates, gamma)
+def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int, gamma: float, after: float) -> None:
+    """A run that is stopped has the draws so far, of which cross-entropy keeps the first round and the last."""
+    result, f = of_simulations(method, replicates, gamma, after)
     assert len(f) == result.n_sim
     rows = result.describe_simulations(0, len(f))
     known = ~np.isnan(rows.log_weight)
+    assert known.any()
     assert np.exp(rows.log_weight[known & (f <= gamma)]).sum() == pytest.approx(result.p, rel=1e-12)
+    if after < math.inf:
+        return
     # the weights of all draws from a proposal have mean 1, and here a c.o.v. of 10 at most: see their spread
     weights = np.exp(rows.log_weight[known])
     assert abs(weights.sum() - 1) <= 5 * weights.std() * len(weights) ** 0.5 + 1e-9
     counts = [np.sum((rows.run == level.run) & (rows.stage >= 0)) for level in result.trace]
     assert sum(level.n_sim for level in result.trace) == len(f) and min(counts) > 0
-
-
-@pytest.mark.parametrize("after", [100, 1500])
-@pytest.mark.parametrize("method", ["is", "ce", "ice", "two-stage", pytest.param("surrogate", marks=pytest.mark.slow)])
-def test_weights_of_a_run_that_is_stopped_add_up_to_p(method: str, after: int) -> None:
-    """p is that of the draws of the search then, of which cross-entropy keeps the first round and the last."""
-    problem = samplers.FunctionProblem(lambda x: 3.0 - np.abs(x[:, 0]), dim=4)
-    result = samplers.estimate(
-        problem, method, seed=1, max_sim=3000, keep_points=True, stop=lambda seen: seen.n_sim >= after
-    )
-    assert result.points is not None
-    rows = result.describe_simulations(0, len(result.points.f))
-    known = ~np.isnan(rows.log_weight)
-    assert known.any()
-    assert np.exp(rows.log_weight[known & (result.points.f <= 0)]).sum() == pytest.approx(result.p, rel=1e-12)
 
 
 def test_stages_are_levels_and_parts_of_the_index_agree_with_the_whole() -> None:

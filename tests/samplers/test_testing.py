@@ -1,4 +1,4 @@
-"""The conformance checks find what is wrong with a method."""
+"""The conformance checks find what is wrong with a method; p of the limit states is exact."""
 
 import random
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import samplers
+from samplers.limit_states import four_branches, half_space, parabola, plateau, shell, two_modes
 from samplers.sample import binomial_cov, clopper_pearson
 from samplers.testing import check_method
 
@@ -93,3 +94,19 @@ def test_overspending_and_crashing_are_errors_of_their_own():
 def test_something_else_than_a_method():
     with pytest.raises(AssertionError, match="attributes name, stops_at_target and steps"):
         check_method(object())
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        *(half_space(3, 1.5), two_modes(distance=0.8), parabola(1.0)),
+        *(four_branches(k=1.8), plateau(beta=1.5), shell(5, 0.05)),
+    ],
+    ids=lambda r: r.name,
+)
+def test_exact_probability_against_monte_carlo(rng, reference):
+    """The same formulas with the failures near enough to be counted."""
+    n = 400_000
+    u = rng.standard_normal((n, reference.problem.dim))
+    share = np.mean(reference.problem.evaluate(u) <= 0)
+    assert share == pytest.approx(reference.p, abs=4 * np.sqrt(reference.p / n))

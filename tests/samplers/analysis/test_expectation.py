@@ -8,17 +8,27 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import samplers
 from samplers.analysis import base_error
 from samplers.analysis.base_error import compute_refit_band
 from samplers.analysis.expectation import compute_exceedance, expect_over_failures, expect_under_refits
 from samplers.analysis.reweight import RefitSums
 from samplers.analysis.weighted import weigh_failures
 from samplers.sample import raise_log_end
-from tests.samplers.analysis.half_space_tail import BETA, METHODS, PHI, P, estimate_half_space
 from tests.samplers.analysis.parametric_normal import ALPHA, fitted, run
 from tests.samplers.fitted_bases import FittedWithEnsemble, normal, resampled
 from tests.samplers.fitted_bases import fitted as fitted_normal
 from tests.samplers.fitted_bases import run as run_normal
+
+BETA = 3.0
+P = float(stats.norm.sf(BETA))
+PHI = float(stats.norm.pdf(BETA))
+METHODS = ["adss", "ce", "mc", "two-stage"]
+
+
+def estimate_half_space(method="two-stage", seed=0, **options):
+    """Return an estimate of P = Phi(-3) in two dimensions."""
+    return samplers.estimate(samplers.FunctionProblem(lambda x: BETA - x[:, 0], 2), method, seed=seed, **options)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -3,12 +3,11 @@
 import math
 
 import numpy as np
-import pytest
 from scipy import stats
 
 import samplers
 from samplers.importance import Search
-from samplers.limit_states import four_branches, half_space, parabola, plateau
+from samplers.limit_states import four_branches, half_space
 from samplers.method import Goal
 from samplers.sample import Status
 
@@ -23,17 +22,6 @@ def test_the_tilt_is_the_mean_of_the_failures(drive):
     assert search.status is Status.CONVERGED
     length = stats.norm.pdf(3.0) / stats.norm.sf(3.0)
     np.testing.assert_allclose(tilt.mean, np.full(2, length / math.sqrt(2)), atol=0.1)
-
-
-@pytest.mark.parametrize(
-    "reference",
-    [pytest.param(half_space(), marks=pytest.mark.slow), pytest.param(parabola(), marks=pytest.mark.slow), plateau()],
-    ids=lambda r: r.name,
-)
-def test_unbiased_and_covered_where_one_tilt_serves(study, reference):
-    found = study(reference, IS(), 60)
-    found.check(confidence=0.93)
-    assert not any(result.warnings for result in found.results)
 
 
 def test_stops_at_the_relative_half_width():
