@@ -27,7 +27,7 @@ from rare_envs.measures.base import (
 )
 from rare_envs.measures.temporal_logic import stl
 from rare_envs.plugins import did_you_mean, make_object
-from rare_envs.traffic.crash import crash_of
+from rare_envs.traffic.crash import contact_speed
 
 FORMULA = "stl:"
 
@@ -46,7 +46,7 @@ def load_measure(measure: Any) -> Any:
 
 def _negative_contact_speed(moment: Moment) -> Tensor:
     """Return the negative speed at which bodies meet in a collision [m/s], shape (B,)."""
-    return -crash_of(moment.state, moment.road, moment.before, moment.dt).closing_speed
+    return -contact_speed(moment.state, moment.road, moment.before, moment.dt)
 
 
 def _to_vehicles_and_edge(of: Callable[[Moment], Tensor]) -> MeasureTerms:

@@ -4,15 +4,16 @@ Two bodies touch when they begin to overlap along the last of the four axes on w
 normal of the contact. Along the tick bodies are taken to move straight, from where they were to where they are.
 """
 
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from rare_envs.devices import indices, may_hold
-from rare_envs.traffic.bodies import Which, boxes_overlap, crossing, encounter, pairs
+from rare_envs.traffic.bodies import boxes_overlap, crossing, encounter, pairs
 from rare_envs.traffic.road import Road
-from rare_envs.traffic.state import State
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 CRASH_KINDS = ("none", "rear_end", "rear_ended", "side", "road_edge", "others")
 """Kinds of crash by number: none; the ego runs into a vehicle ahead; it is run into from behind; flank against flank
@@ -25,6 +26,9 @@ MPH = 2.2369362920544
 """Miles per hour in a metre per second."""
 MAIS3 = {"all": (-6.9540, 0.1637), "frontal": (-6.9774, 0.1620), "rear": (-8.0329, 0.1793)}
 """Intercept and slope per mph of delta-v, by crash mode; see `injury_risk`."""
+NumberT = TypeVar("NumberT", float, Tensor)
+_ROUNDING = 1e-4
+"""Bodies that overlap in single precision are no further apart than this [m]."""
 
 
 class Crash(NamedTuple):
@@ -77,7 +81,7 @@ class Crash(NamedTuple):
         )
 
 
-def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
+def injury_risk(delta_v: NumberT, mode: str = "all") -> NumberT:
     """Return the probability of a serious injury (MAIS 3 or more) of an occupant by delta-v [m/s], any shape.
 
     Logistic, 1 / (1 + exp(-(a + b delta-v))), from tow-away crashes of light vehicles in the United States, 2010 to
@@ -86,7 +90,8 @@ def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
     at 0 (about 0.1 %), so it is an order of severity rather than a forecast.
     """
     intercept, slope = MAIS3[mode]
-    return torch.sigmoid(intercept + slope * MPH * delta_v)
+    exponent = intercept + slope * MPH * delta_v
+    return torch.sigmoid(exponent) if isinstance(exponent, Tensor) else 1.0 / (1.0 + math.exp(-exponent))
 
 
 def crash_of(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
@@ -94,81 +99,128 @@ def crash_of(state: State, road: Road, before: State | None = None, dt: float = 
 
     With the first vehicle that it touched, or with the edge of the road where it overlaps none and is off the road.
     """
-    crash = _pair_crash(state, road, before, dt, "ego")
-    off = (crash.kind == NONE) & road.off_road(state.y[:, 0])
-    return crash.replace_where(off, _edge_crash(state, before, dt)) if may_hold(off) else crash
+    off_road = road.off_road(state.y[:, 0]).tolist()
+    return _find_crashes(state, road, before, dt, [(0, j) for j in range(1, state.x.shape[1])], off_road)
 
 
 def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
     """Return the crash of vehicles other than the ego, of kind "others"; arguments as of `crash_of`."""
-    crash = _pair_crash(state, road, before, dt, "others")
+    couples = [couple for couple in zip(*pairs(state.x.shape[1]), strict=True) if 0 not in couple]
+    crash = _find_crashes(state, road, before, dt, couples, [False] * len(state.x))
     return crash._replace(kind=torch.where(crash.kind == NONE, NONE, OTHERS))
 
 
-def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: Which) -> Crash:
-    """Return the first contact among some pairs of vehicles."""
-    n = state.x.shape[1]
-    of_pairs = slice(0, n - 1) if which == "ego" else slice(n - 1, None)
-    numbers = [indices(index[of_pairs], state.x) for index in pairs(n)]
-    if not len(numbers[0]):
+class _Body(NamedTuple):
+    """A vehicle at the end of a tick [m, rad, m/s]."""
+
+    x: float
+    """In the flat world, as the next four."""
+    y: float
+    heading: float
+    vx: float
+    vy: float
+    ahead: float
+    """Place along the road, and speed; then across it."""
+    along: float
+    aside: float
+    across: float
+    speed: float
+
+
+def _find_crashes(
+    state: State, road: Road, before: State | None, dt: float, couples: Sequence[tuple[int, int]], off_road: list[bool]
+) -> Crash:
+    """Return the first contacts among couples of vehicles, row by row: few crash in a tick, each other than the next.
+
+    So no numbers of many rows are worked on side by side, of which each takes longer to start than to compute.
+    """
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    if before is None:
+        vx, vy = state.speed * torch.cos(heading), state.speed * torch.sin(heading)
+        along, across = state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading)
+    else:
+        old_x, old_y, _ = road.to_world(before.x, before.y, before.heading)
+        vx, vy = (x - old_x) / dt, (y - old_y) / dt
+        along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
+    columns = (x, y, heading, vx, vy, state.x, along, state.y, across, state.speed)
+    table = torch.stack(columns, dim=-1).tolist()
+    if not table:
         return Crash.nothing(state.x[:, 0])
-    met = encounter(state, road, which, before, dt)
+    rows = [_find_crash([_Body(*each) for each in row], couples, off) for row, off in zip(table, off_road, strict=True)]
+    kind, vehicles, *numbers = zip(*rows, strict=True)
+    whole = (torch.tensor(each, device=x.device) for each in (kind, vehicles))
+    return Crash(*whole, *(torch.tensor(each, dtype=x.dtype, device=x.device) for each in numbers))
+
+
+def _find_crash(bodies: Sequence[_Body], couples: Sequence[tuple[int, int]], off_road: bool) -> tuple[Any, ...]:
+    """Return the fields of a `Crash` of one row."""
+    contacts = [(_find_contact(bodies[i], bodies[j]), i, j) for i, j in couples]
+    touching = [(contact, i, j) for contact, i, j in contacts if contact is not None]
+    if touching:
+        (_, kind, closing, impact), one, other = min(touching, key=lambda each: each[0][0])
+        first, second = bodies[one], bodies[other]
+        ways = (second.aside - first.aside, first.across, second.across)
+        way, own, its = ways if kind == SIDE else (second.ahead - first.ahead, first.along, second.along)
+        runs = own * _sign(way) >= -its * _sign(way)  # who moves faster towards the other
+        change, both = (1.0 + RESTITUTION) / 2.0 * closing, ("all", "all") if kind == SIDE else ("frontal", "rear")
+        risks = [injury_risk(change, mode) for mode in both]
+        return kind, (one, other) if runs else (other, one), impact, closing, (change, change), risks
+    if off_road:
+        across = abs(bodies[0].across)
+        change = (1.0 + RESTITUTION) * across
+        return ROAD_EDGE, (0, -1), bodies[0].speed, across, (change, 0.0), (injury_risk(change), 0.0)
+    return NONE, (-1, -1), 0.0, 0.0, (0.0, 0.0), (0.0, 0.0)
+
+
+def _find_contact(one: _Body, other: _Body) -> tuple[float, int, float, float] | None:
+    """Return when two bodies began to overlap [s], at most 0, the kind, closing and relative speed; None if apart."""
+    dx, dy, dvx, dvy = other.x - one.x, other.y - one.y, other.vx - one.vx, other.vy - one.vy
+    turn = other.heading - one.heading
+    cos_turn, sin_turn = abs(math.cos(turn)) / 2, abs(math.sin(turn)) / 2
+    axes = []
+    for number, course in enumerate((one.heading, one.heading, other.heading, other.heading)):
+        cos, sin = math.cos(course), math.sin(course)
+        if number % 2 == 0:
+            offset, rate = dx * cos + dy * sin, dvx * cos + dvy * sin
+            reach = VEHICLE_LENGTH / 2 + VEHICLE_LENGTH * cos_turn + VEHICLE_WIDTH * sin_turn
+        else:
+            offset, rate = dy * cos - dx * sin, dvy * cos - dvx * sin
+            reach = VEHICLE_WIDTH / 2 + VEHICLE_LENGTH * sin_turn + VEHICLE_WIDTH * cos_turn
+        gap = abs(offset) - reach
+        if gap >= _ROUNDING:
+            return None
+        since = -offset / rate - reach / abs(rate) if rate else -math.inf
+        axes.append((since, gap, number, -rate * _sign(offset), offset))
+    since, _, number, closing, _ = max(axes, key=lambda each: each[0])
+    if since == -math.inf:  # nothing moves: the axis along which they overlap least
+        _, _, number, closing, _ = max(axes, key=lambda each: each[1])
+    angle = turn if number >= 2 else 0.0
+    lengthwise = (abs(math.cos(angle)) >= abs(math.sin(angle))) == (number % 2 == 0)
+    kind = (REAR_END if axes[0][-1] > 0 else REAR_ENDED) if lengthwise else SIDE
+    return since, kind, max(closing, 0.0), math.hypot(dvx, dvy)
+
+
+def _sign(value: float) -> float:
+    """Return 1, -1 or 0."""
+    return math.copysign(1.0, value) if value else 0.0
+
+
+def contact_speed(state: State, road: Road, before: State | None, dt: float) -> Tensor:
+    """Return the closing speed of the ego's crash [m/s], (B,), 0 for none: as `crash_of`, of many rows at once."""
+    met = encounter(state, road, "ego", before, dt)
     axes, rate = met.axes, met.rate
-    enter, _ = crossing(axes, rate)
-    since, axis = enter.max(-1)
-    resting = torch.isinf(since)  # nothing moves: the axis along which they overlap least
+    since, axis = crossing(axes, rate)[0].max(-1)
+    resting = torch.isinf(since)
     axis = torch.where(resting, axes.gap.argmax(-1), axis)
     touching = boxes_overlap(*met[:4])
     at = torch.where(touching, torch.where(resting, torch.finfo(since.dtype).min, since), torch.inf)
-    pair = at.argmin(1, keepdim=True)
-
-    def of(values: Tensor) -> Tensor:
-        return values.gather(1, pair)[:, 0]
-
-    def on_axis(values: Tensor) -> Tensor:
-        return of(values.gather(-1, axis[..., None])[..., 0])
-
-    towards = torch.sign(on_axis(axes.offset))  # the normal points from the first to the second
-    closing = (-on_axis(rate) * towards).clamp(min=0.0)
-    couple = torch.stack([of(each.expand_as(at)) for each in numbers], -1)
-    kind = _kind(of(axis), of(met.other_heading - met.heading), of(axes.offset[..., 0]))
-    own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
-    vehicles = torch.where((own >= its)[:, None], couple, couple.flip(-1))
-    change = ((1.0 + RESTITUTION) / 2.0 * closing)[:, None].expand(-1, 2)
-    modes = [injury_risk(change[:, 0], mode) for mode in ("frontal", "rear", "all")]
-    risk = torch.where((kind != SIDE)[:, None], torch.stack(modes[:2], -1), modes[2][:, None])
-    speed = of((met.dvx.square() + met.dvy.square()).sqrt())
-    crash, apart = Crash(kind, vehicles, speed, closing, change, risk), ~touching.any(1)
-    return crash.replace_where(apart, Crash.nothing(speed)) if may_hold(apart) else crash
-
-
-def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
-    """Return the speed of the first of two towards the second, across the road or along it [m/s], shape (B,)."""
-    along, across = state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading)
-    if before is not None:
-        along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
-    place, speed = torch.where(side[:, None], state.y, state.x), torch.where(side[:, None], across, along)
-    first, second = place.gather(1, couple).unbind(1)
-    return speed.gather(1, couple[:, :1])[:, 0] * torch.sign(second - first)
-
-
-def _kind(axis: Tensor, turn: Tensor, ahead: Tensor) -> Tensor:
-    """Return the kind by the normal's angle to the heading of the first, and by whether the second is ahead of it."""
-    angle = torch.where(axis >= 2, turn, 0.0)
-    lengthwise = (torch.cos(angle).abs() >= torch.sin(angle).abs()) == (axis % 2 == 0)
-    return torch.where(lengthwise, torch.where(ahead > 0, REAR_END, REAR_ENDED), SIDE)
-
-
-def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
-    """Return the crash of the ego with the edge of the road, a wall along it."""
-    crash = Crash.nothing(state.x[:, 0])
+    towards = (-rate * torch.sign(axes.offset)).gather(-1, axis[..., None])[..., 0]
+    closing = towards.gather(1, at.argmin(1, keepdim=True))[:, 0].clamp(min=0.0)
     across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
     if before is not None:
         across = (state.y[:, 0] - before.y[:, 0]) / dt
-    change = torch.stack(((1.0 + RESTITUTION) * across.abs(), torch.zeros_like(across)), -1)
-    risk = torch.stack((injury_risk(change[:, 0]), torch.zeros_like(across)), -1)
-    edge = crash.vehicles + indices((1, 0), across)
-    return Crash(torch.full_like(crash.kind, ROAD_EDGE), edge, state.speed[:, 0], across.abs(), change, risk)
+    alone = torch.where(road.off_road(state.y[:, 0]), across.abs(), 0.0)
+    return torch.where(touching.any(1), closing, alone)
 
 
 def describe_crash(crash: Crash, row: int = 0) -> dict[str, Any] | None:

@@ -10,8 +10,16 @@ import torch
 
 import rare_envs
 from rare_envs.traffic.bodies import overlaps
-from rare_envs.traffic.crash import CRASH_KINDS, crash_of, crash_of_others, describe_crash, injury_risk
+from rare_envs.traffic.crash import (
+    CRASH_KINDS,
+    contact_speed,
+    crash_of,
+    crash_of_others,
+    describe_crash,
+    injury_risk,
+)
 from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import COASTING
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
 from tests.rare_envs.traffic_states import F64, traffic
@@ -124,6 +132,23 @@ def test_the_first_contact_is_found_as_small_steps_find_it() -> None:
             assert (striker == 0) == (own > its)
         assert crash.impact_speed[0].item() == pytest.approx(math.hypot(vx[other] - vx[0], vy[other] - vy[0]))
     assert seen == {"rear_end", "rear_ended", "side"}
+
+
+@pytest.mark.parametrize(("turned", "speed"), [(0.0, 30.0), (0.2, 30.0), (1.5, 10.0), (0.1, 0.0)])
+def test_contact_speeds_of_many_are_those_of_their_crashes(turned: float, speed: float) -> None:
+    """Three vehicles near each other, some of them at rest, on the road and beside it."""
+    rng = np.random.default_rng(3)
+    ranges = ((0, 12), (-3, 7), (-turned, turned), (0, speed))
+    x, y, heading, speeds = (torch.from_numpy(rng.uniform(low, high, (500, 3))).float() for low, high in ranges)
+    speeds = speeds * torch.from_numpy(rng.random((500, 3)) < 0.8)
+    now = State(x, y, heading, speeds, theta=x[:, :0])
+    along, across = speeds * torch.cos(heading) * 0.1, speeds * torch.sin(heading) * 0.1
+    for before in (None, now._replace(x=x - along, y=y - across)):
+        crash = crash_of(now, straight(2), before, 0.1)
+        found = contact_speed(now, straight(2), before, 0.1)
+        torch.testing.assert_close(found, crash.closing_speed, rtol=1e-4, atol=1e-4)
+    kinds = {CRASH_KINDS[kind] for kind in crash.kind}
+    assert kinds >= {"none", "rear_end", "rear_ended", "side", "road_edge"}
 
 
 # the cutter, at 30 m/s 30 m behind a lead at 5 m/s, cannot stop; the ego is 60 m away
