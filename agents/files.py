@@ -31,6 +31,11 @@ VISION, SHIPPED_EGOS, SHIPPED_DRIVERS = "vision", ("imitation",), ("mgail", "gai
 """Shipped networks: the ego with a camera, drivers that were trained to be egos, drivers of the traffic."""
 SHIPPED, SUFFIX = Path(__file__).parent / "data", ".safetensors"
 """Folder of the shipped files, and how files of networks end."""
+ADAPTER_ADVICE = (
+    "write a function that builds the network and loads it, and name module:function?file={file} (docs/egos.md, "
+    "Policies from elsewhere), or export it to ONNX"
+)
+"""What to do with a file of weights alone."""
 DRIVER_ENTRY, VISION_ENTRY = "driver", "vision"
 """A header's one entry: several would be written in no fixed order, and equal drivers not as equal bytes."""
 
@@ -105,7 +110,8 @@ def read_file(path: Path, *entries: str) -> tuple[dict[str, Any], dict[str, Tens
         raise _no_safetensors(path, str(error)) from None
     texts = [header[entry] for entry in entries if entry in header]
     if not texts:
-        raise ValueError(f"{str(path)!r} holds tensors but no {entries[0]}: save drivers with agents.save_driver.")
+        advice = f"save drivers with agents.save_driver; for another policy {ADAPTER_ADVICE.format(file=path)}"
+        raise ValueError(f"{str(path)!r} holds tensors but no {entries[0]}: {advice}.")
     _check_finite(tensors, path)
     return parse_json_object(texts[0], f"The header of {str(path)!r}"), tensors
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import files
-from agents.files import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, SUFFIX, VISION
+from agents.files import ADAPTER_ADVICE, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, SUFFIX, VISION
 from agents.imperfect_stack import NoisyEgo, Stack
 from agents.learned.driver import LearnedDriver, LearnedEgo, RuleDriver, read_driver
 from agents.learned.networks import HUMAN_NOISE
@@ -35,6 +35,8 @@ EXPECTED_EGO: Final = (
 )
 EGO_SUFFIXES = (".zip", ".onnx", SUFFIX)
 """How the files of egos end."""
+WEIGHTS_SUFFIXES = (".pt", ".pth", ".ckpt", ".cleanrl_model", ".pkl", ".pickle", ".msgpack")
+"""How files end whose network only their author's code has."""
 
 
 @runtime_checkable
@@ -85,11 +87,11 @@ def load_ego(
             the front camera; "mgail" or "gail", drivers of the traffic, by their mean actions ("mgail?rules=0" by its
             network alone); a path to a `.safetensors` with one of these kinds, to a `.zip` saved by Stable-Baselines3,
             or to an `.onnx` file (`agents.onnx.OnnxEgo` has its form); "hf:USER/REPOSITORY", such a `.zip` of the
-            Hugging Face Hub; `module:function`, a function without arguments that returns an ego (modules in the
-            working directory are found); `tcp://host:port` for an ego in another program (docs/egos.md); `process:EGO`,
-            any of these files and functions in a process of its own, which is ended and started again if the ego
-            hangs or dies; `noisy:EGO`, any ego behind the imperfections of a full stack
-            (`agents.imperfect_stack.Stack`).
+            Hugging Face Hub; `module:function`, a function that returns an ego (modules in the working directory are
+            found), called without arguments, with file="a.pt" for "module:function?file=a.pt"; `tcp://host:port` for an
+            ego in another program (docs/egos.md); `process:EGO`, any of these files and functions in a process of its
+            own, which is ended and started again if the ego hangs or dies; `noisy:EGO`, any ego behind the
+            imperfections of a full stack (`agents.imperfect_stack.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs any code in them. Without it
             a file that needs code of its author's is refused, and one to which everybody may write.
@@ -207,6 +209,10 @@ def _refuse_url(text: str, *_: Any) -> Any:
     raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
 
 
+def _refuse_weights(text: str, *_: Any) -> Any:
+    raise ValueError(f"The network of {text!r} is not in the file: {ADAPTER_ADVICE.format(file=text)}.")
+
+
 def _make_ego(spec: str, *_: Any) -> Any:
     """Return what `module:name` gives: "idm" or an object with `predict`; a plain function is wrapped in one."""
     ego = wrap_callable(make_object(spec, "ego"))
@@ -232,6 +238,7 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
         lambda text, *_: LearnedEgo(cast(LearnedDriver, load_driver(text))),
     ),
     "onnx": (lambda spec: spec.endswith(".onnx"), _load_onnx),
+    "weights": (lambda spec: spec.endswith(WEIGHTS_SUFFIXES) and isfile(spec), _refuse_weights),
     "zip": (
         lambda spec: spec.endswith(".zip") or isfile(spec),  # of too long a name too
         lambda text, *how: load_saved_ego(Path(text), *how),

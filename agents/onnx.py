@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from agents.files import MAX_NETWORK_BYTES, report_missing_file
 from agents.saved_ego import SavedEgo
 from rare_envs.control.actions import DISCRETE_ACTIONS
+from rare_envs.egos.needs import read_output
 from rare_envs.files import open_ordinary, replace_file
 from rare_envs.plugins import one_line
 from rare_envs.startup import advise_install
@@ -146,11 +147,7 @@ class OnnxEgo:
             anew = np.asarray(episode_start, dtype=bool)
             memory = [np.where(anew.reshape(-1, *[1] * (part.ndim - 1)), 0, part) for part in memory]
         action, *memory = self._run([observation, *memory])
-        if np.issubdtype(action.dtype, np.integer):
-            action = action[:, 0] if action.ndim == 2 and action.shape[1] == 1 else action
-        elif _are_scores(action.shape):
-            action = action.argmax(axis=1)
-        return action, tuple(memory) or None
+        return read_output(action), tuple(memory) or None
 
     def _blank(self, rows: int) -> list[NDArray[Any]]:
         """Return inputs of zeros for so many rows, which are along the first axis."""

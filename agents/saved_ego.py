@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from agents.files import report_missing_file
 from agents.safe_pickle import TRUST, TRUST_ADVICE, ForbiddenObject, find_origin_risks, open_pickle
 from agents.sb3_archive import build_policy, check_space, find_algorithm, read_archive
-from rare_envs.egos.wrappers import UNBOUNDED, WrappedPolicy, find_stacking
+from rare_envs.egos.wrappers import STATS_ADVICE, UNBOUNDED, WrappedPolicy, find_stacking
 from rare_envs.files import read_bytes
 from rare_envs.plugins import one_line
+from rare_envs.simulation.observation import observation_space
 from rare_envs.startup import advise_install
 
 HUB_PREFIX = "hf:"
@@ -41,6 +42,9 @@ _BEYOND = 1e-3
 """Observations beyond the bounds by less are rounding."""
 _STEP = 0.5
 """A change of the observations of ordinary environments in one step is smaller; `VecNormalize` moves some by more."""
+_FASTEST = 0.6
+"""Speed of an ego in Kinematics, 48 m/s of 80: HighwayEnv's stay below, and cosines of headings are above."""
+CONFIG_ADVICE = "test it in HighwayEnv's own environment with the config of its training (env_config)"
 OUTLYING = 5.0
 """Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
 _MIN_ROWS, _SPREAD, _CENTRE = 16, (0.3, 3.0), 1.5
@@ -121,12 +125,19 @@ class SavedEgo:
         """Return what is wrong with its statistics for an environment's space of observations; "" if nothing seems."""
         if self.statistics is not None:
             why = describe_foreign_statistics(self.header, self.statistics, self.policy.observation_space)
-            return f"the VecNormalize statistics {self.statistics_path} seem to be those of another ego: {why}" * bool(
-                why
-            )
+            other = f"the VecNormalize statistics {self.statistics_path} seem to be those of another ego"
+            return f"{other}: {why}; {STATS_ADVICE}" if why else ""
         last = _open_observation(self.header, LAST)
-        missing = describe_missing_statistics(self.header, last, self.policy.observation_space, expected)
-        return f"the ego has no VecNormalize statistics, but {missing}" * bool(missing)
+        if missing := describe_missing_statistics(self.header, last, self.policy.observation_space, expected):
+            return f"the ego has no VecNormalize statistics, but {missing}; {STATS_ADVICE}"
+        if (
+            isinstance(last, np.ndarray)
+            and last.ndim == 3
+            and last.shape[1:] == expected.shape == observation_space(2, "kinematics").shape
+        ):
+            what = describe_other_kinematics(last)
+            return f"the observations of the ego's training were {what}; {CONFIG_ADVICE}" if what else ""
+        return ""
 
     def predict(
         self,
@@ -259,6 +270,18 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
     normal = bool(((_SPREAD[0] < spread) & (spread < _SPREAD[1]) & (centre < _CENTRE)).all())
     if len(last) >= _MIN_ROWS and last.shape[1] > 1 and normal:
         return "the last observations of its training have mean 0 and spread 1 in every column, or nearly so"
+    return ""
+
+
+def describe_other_kinematics(seen: NDArray[Any]) -> str:
+    """Return which setting of HighwayEnv's Kinematics is not its default in observations (B, 5, 5); "" if none is."""
+    ego, others = seen[:, 0], seen[:, 1:][seen[:, 1:, 0] > 0]
+    if np.abs(seen).max() > 1.0 + _BEYOND:
+        return "not normalised (normalize)"
+    if not np.isin(seen[..., 0], (0, 1)).all() or ego[:, 3].max() > _FASTEST:
+        return "of other features than presence, x, y, vx, vy (features)"
+    if len(others) and others[:, 3].min() > ego[:, 3].max() / 2 > 0:  # relative speeds that are as large are not found
+        return "not relative to the ego (absolute)"
     return ""
 
 

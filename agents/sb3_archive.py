@@ -73,6 +73,9 @@ def read_archive(path: Path) -> tuple[dict[str, Any], bytes]:
         header = parse_json_object(members.get("data", b"{}").decode(), f"The member 'data' of {name}")
     except ValueError as error:
         raise ValueError(f"{error} Expected a model as Stable-Baselines3 saves it.") from error
+    if _policy_module(header).startswith("sbx."):
+        call = "module:function, whose function returns sbx.PPO.load(FILE), or of the algorithm that it is"
+        raise ValueError(f"{name} is a model of sbx, whose parameters are JAX's: name {call} (docs/egos.md).")
     if "policy.pth" not in members or "policy_class" not in header:
         raise ValueError(
             f"{name} is a zip file but not a Stable-Baselines3 model: it lacks its members "
@@ -83,10 +86,15 @@ def read_archive(path: Path) -> tuple[dict[str, Any], bytes]:
     ]
 
 
+def _policy_module(header: Mapping[str, Any]) -> str:
+    """Return the module of a saved model's policy; "" if its settings do not tell."""
+    policy = header.get("policy_class")
+    return str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
+
+
 def find_algorithm(header: Mapping[str, Any], algo: str | None, name: str) -> str:
     """Return the name of the algorithm of a saved model, one of `ALGORITHMS`, from its settings or as a user says."""
-    policy = header.get("policy_class")
-    module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
+    module = _policy_module(header)
     if algo is not None:
         if algo.lower() not in ALGORITHMS:
             hint = did_you_mean(algo, ALGORITHMS)

@@ -58,24 +58,35 @@ def import_object(spec: str, purpose: str) -> Any:
 
 
 def names_object(spec: str) -> bool:
-    """Return whether a name has the form of "module:name", which a file may have too."""
-    return ":" in spec and not {"/", "\\"} & {*spec}
+    """Return whether a name has the form of "module:name", with settings behind it or not; a file may have it too."""
+    name = spec.partition("?")[0]
+    return ":" in name and not {"/", "\\"} & {*name}
+
+
+def split_settings(spec: str) -> tuple[str, dict[str, str]]:
+    """Return the name and the settings in "module:name?file=policy.pt&layers=2", texts as they stand."""
+    name, _, query = spec.partition("?")
+    return name, {key: value for key, _, value in (each.partition("=") for each in query.split("&") if each)}
 
 
 def make_object(spec: str, kind: str, call: bool = True) -> Any:
     """Return the object of a kind, for messages, that "module:name" stands for.
 
-    A class is called without arguments, and so is a function if it makes the object (`call`) and is not itself it.
+    A class is called, and so is a function if it makes the object (`call`) and is not itself it: with the settings
+    behind its name as keyword arguments, see `split_settings`.
     """
-    found = import_object(spec, f"the {kind} {spec!r}")
-    if not isinstance(found, type) and not (call and inspect.isroutine(found)):
+    name, settings = split_settings(spec) if call else (spec, {})
+    found = import_object(name, f"the {kind} {name!r}")
+    if not settings and not isinstance(found, type) and not (call and inspect.isroutine(found)):
         return found
+    given = ", ".join(f"{key}={value!r}" for key, value in settings.items())
     try:
         with as_errors():
-            return found()
+            return found(**settings)
     except Exception as error:  # it is the user's: anything may happen in it
         raise ValueError(
-            f"{spec!r}, called without arguments, failed to make the {kind}: {one_line(error)}."
+            f"{name!r}, called with{f' {given}' if given else 'out arguments'}, failed to make the {kind}: "
+            f"{one_line(error)}."
         ) from error
 
 

@@ -219,7 +219,7 @@ class ProcessLink(ServerLink):
 
 def parse_address(spec: str) -> tuple[str, dict[str, float]]:
     """Split "tcp://127.0.0.1:5555?timeout=10&patience=30" into the address and the time-outs."""
-    address, mark, query = spec.partition("?")
+    address, mark, query = spec.rpartition("?") if "?" in spec else (spec, "", "")
     try:
         settings = {name: float(value) for name, value in parse_qsl(query, strict_parsing=bool(mark))}
     except ValueError:

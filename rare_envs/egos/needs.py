@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from torch.distributions import Distribution
 
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.control.idm import IDM
@@ -74,7 +75,7 @@ class FunctionEgo:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
         """Stable-Baselines3's `predict`; the function has no memory."""
-        return np.asarray(self.function(observation)), state
+        return np.asarray(read_output(self.function(observation))), state
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,17 @@ class ModuleEgo:
     """A torch module from observations to actions as an ego: in evaluation mode, without gradients."""
 
     module: torch.nn.Module
-    """Maps observations of B scenarios to actions, as the function of a `FunctionEgo`; float tensors in its dtype."""
+    """Maps observations of B scenarios to what `read_output` takes; float tensors in its dtype."""
+
+    @property
+    def observation_space(self) -> Any:
+        """Space of the observations, where the module has one."""
+        return getattr(self.module, "observation_space", None)
+
+    @property
+    def action_space(self) -> Any:
+        """Space of the actions, where the module has one."""
+        return getattr(self.module, "action_space", None)
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -96,8 +107,32 @@ class ModuleEgo:
         parameter = next(self.module.parameters(), torch.empty(0))
         shown = map_kinds(lambda part: torch.as_tensor(part).to(parameter), observation)
         with torch.no_grad():
-            actions: torch.Tensor = self.module(shown)
+            actions: torch.Tensor = read_output(self.module(shown))
         return actions
+
+
+def read_output(output: Any) -> Any:
+    """Return the actions in what a network gives: of five scores the best, of a distribution the mode, not the values.
+
+    Values are what stands, (B, 1), behind the actions in a pair; other pairs could be mean and deviation, whose mean
+    some algorithms squash: a ValueError says so.
+    """
+    if isinstance(output, tuple | list) and any(isinstance(part, torch.Tensor | Distribution) for part in output):
+        output, *others = output
+        if len(others) != 1 or getattr(others[0], "ndim", 0) != 2 or others[0].shape[1] != 1:
+            raise ValueError(
+                f"Expected a network that gives actions, or actions and values (B, 1), got {1 + len(others)} outputs; "
+                "put a module around it that gives actions alone: the mean as it is (PPO), tanh of it (SAC)."
+            )
+    if isinstance(output, Distribution):
+        output = output.mode
+    output = output.detach() if isinstance(output, torch.Tensor) else output
+    if getattr(output, "ndim", 0) != 2:
+        return output
+    columns, real = output.shape[1], "float" in str(output.dtype)  # an array's, a tensor's, JAX's
+    if real:
+        return output.argmax(1) if columns == len(DISCRETE_ACTIONS) else output
+    return output[:, 0] if columns == 1 else output
 
 
 def wrap_callable(ego: Any) -> Any:

@@ -158,5 +158,5 @@ def find_normalisation_doubt(ego: Any, given: spaces.Space[Any]) -> str:
     elif getattr(policy, "get_vec_normalize_env", lambda: policy)() is None:
         own, bounded = policy.observation_space, isinstance(given, spaces.Box) and np.isfinite(given.high).all()
         if bounded and isinstance(own, spaces.Box) and np.isinf(own.high).all():
-            doubt = f"the ego has no VecNormalize statistics, but {UNBOUNDED}"
-    return f"{doubt}; {STATS_ADVICE}" if doubt else ""
+            doubt = f"the ego has no VecNormalize statistics, but {UNBOUNDED}; {STATS_ADVICE}"
+    return doubt

@@ -320,7 +320,8 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
         return
     name, statistics, path = "normalisation", ego.statistics, ego.statistics_path
     if doubt := ego.find_normalisation_doubt(probe.problem.world.observation_space):
-        yield Finding(name, "warn", doubt, "name their file with --stats")
+        what, _, advice = doubt.rpartition("; ")
+        yield Finding(name, "warn", what, advice)
     elif ego.left_out is not None:
         yield Finding(name, "pass", "; ".join(ego.notes))
     elif statistics is None:

@@ -32,7 +32,7 @@ from rare_envs.egos.needs import RULE_BASED_EGOS
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import WrappedPolicy
 from rare_envs.files import format_json, replace_text
-from rare_envs.plugins import EgoGone
+from rare_envs.plugins import EgoGone, split_settings
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.world import rollout
 from rare_envs.startup import __version__
@@ -248,9 +248,9 @@ _ELSEWHERE = """
 import importlib, os, pickle, sys
 answer = os.dup(1)
 os.dup2(2, 1)
-here, sys.path[:], module, name, queries = pickle.load(sys.stdin.buffer)
+here, sys.path[:], module, name, settings, queries = pickle.load(sys.stdin.buffer)
 os.chdir(here)
-ego = getattr(importlib.import_module(module), name)()
+ego = getattr(importlib.import_module(module), name)(**settings)
 if not hasattr(ego, "predict"):
     from rare_envs.egos.needs import wrap_callable
     ego = wrap_callable(ego)
@@ -288,10 +288,11 @@ def count_other_answers(study: Study, x: FloatArray) -> int | None:
     policy = replace(driver.policy, policy=recorder) if isinstance(driver.policy, WrappedPolicy) else recorder
     try:
         rollout(study.problem.world, replace(driver, policy=policy), torch.from_numpy(x).float())
-        queries, module = [(seen, start) for seen, start, _ in recorder.kept], name.partition(":")[0]
+        queries, (name, settings) = [(seen, start) for seen, start, _ in recorder.kept], split_settings(name)
+        module = name.partition(":")[0]
         top = Path(str(sys.modules[module.partition(".")[0]].__file__))
         places = [str(top.parents[top.name == "__init__.py"]), *sys.path]
-        message = pickle.dumps((os.getcwd(), places, *name.split(":"), queries))
+        message = pickle.dumps((os.getcwd(), places, *name.split(":"), settings, queries))
         own = np.concatenate([action.reshape(len(action), -1) for _, _, action in recorder.kept])
         apart = np.abs([_ask_elsewhere(message) - own for _ in range(N_PROCESSES)])
     except (Exception, EgoGone):  # it does not answer there at all

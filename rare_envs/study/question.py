@@ -36,7 +36,7 @@ from rare_envs.egos.needs import EgoWarning
 from rare_envs.egos.policy import split_drivers
 from rare_envs.files import digest_file, open_ordinary, parse_json_object, read_text_file
 from rare_envs.measures.registry import MEASURES
-from rare_envs.plugins import EgoGone, names_object
+from rare_envs.plugins import EgoGone, names_object, split_settings
 from rare_envs.problem import DrivingProblem
 from rare_envs.scenarios.base import load_base
 from rare_envs.scenarios.registry import find_scenario
@@ -259,15 +259,18 @@ def _find_policy_files(name: str, stats: str | None = None) -> list[Path]:
 
 
 def find_named_files(name: str) -> list[Path]:
-    """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, hf:user/a, module:function."""
+    """Return the files that an option names, or that of its module: a.zip, hf:user/a, module:function?file=a.pt."""
     if name.startswith(HUB_PREFIX):
         cached = find_hub_model(name, download=False)
         return [] if cached is None else [cached]
-    parts = name.split(":")
+    spec, settings = split_settings(name) if names_function(name) else (name, {})
+    parts = spec.split(":")
     with contextlib.suppress(OSError, ValueError):  # too long a name, or with a null byte
-        files = [path for path in map(Path, (name, *parts)) if path.is_file()]
+        files, given = (
+            [path for path in map(Path, names) if path.is_file()] for names in ((name, *parts), settings.values())
+        )
         modules = (find_module_file(part) for part in parts[:-1] if part.replace(".", "_").isidentifier())
-        return files or [path for path in modules if path is not None]
+        return [*(files or [path for path in modules if path is not None]), *given]
     return []
 
 
