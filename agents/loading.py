@@ -182,8 +182,8 @@ def _load_rule_based(text: str, *_: Any) -> Any:
 def _load_noisy(text: str, *how: Any) -> NoisyEgo:
     """Return any ego behind the imperfections of a full stack."""
     inner, mark, settings = _require_inner_ego(text).rpartition("?")
-    ego = load_ego(inner if mark else settings, *how)
-    return NoisyEgo(ego, Stack(**_read_settings(Stack, settings if mark else "")))
+    stack = Stack(**_read_settings(Stack, settings if mark else ""))
+    return NoisyEgo(load_ego(inner if mark else settings, *how), stack)
 
 
 def _load_elsewhere(text: str, *how: Any) -> Any:

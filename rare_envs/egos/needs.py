@@ -84,16 +84,9 @@ class ModuleEgo:
 
     module: torch.nn.Module
     """Maps observations of B scenarios to what `read_output` takes; float tensors in its dtype."""
-
-    @property
-    def observation_space(self) -> Any:
-        """Space of the observations, where the module has one."""
-        return getattr(self.module, "observation_space", None)
-
-    @property
-    def action_space(self) -> Any:
-        """Space of the actions, where the module has one."""
-        return getattr(self.module, "action_space", None)
+    observation_space: Any = None
+    action_space: Any = None
+    """Spaces of observations and actions, if it has them."""
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -117,12 +110,13 @@ def read_output(output: Any) -> Any:
     Values are what stands, (B, 1), behind the actions in a pair; other pairs could be mean and deviation, whose mean
     some algorithms squash: a ValueError says so.
     """
-    if isinstance(output, tuple | list) and any(isinstance(part, torch.Tensor | Distribution) for part in output):
+    if isinstance(output, tuple) and any(isinstance(part, torch.Tensor | Distribution) for part in output):
         output, *others = output
         if len(others) != 1 or getattr(others[0], "ndim", 0) != 2 or others[0].shape[1] != 1:
             raise ValueError(
                 f"Expected a network that gives actions, or actions and values (B, 1), got {1 + len(others)} outputs; "
-                "put a module around it that gives actions alone: the mean as it is (PPO), tanh of it (SAC)."
+                "put a module around it that gives actions alone (the mean of PPO, tanh of SAC's), or an object with "
+                "predict if it has a memory."
             )
     if isinstance(output, Distribution):
         output = output.mode
@@ -141,7 +135,8 @@ def wrap_callable(ego: Any) -> Any:
         return ego
     if any(hasattr(ego, name) for name in ("act", "in_world")):  # a driver, or an ego of worlds, that has __call__ too
         return ego
-    return ModuleEgo(ego) if isinstance(ego, torch.nn.Module) else FunctionEgo(ego)
+    declared = (getattr(ego, f"{name}_space", None) for name in ("observation", "action"))
+    return ModuleEgo(ego, *declared) if isinstance(ego, torch.nn.Module) else FunctionEgo(ego)
 
 
 _COLOUR_CHANNELS = (3, 6, 9, 12)

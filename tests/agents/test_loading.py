@@ -51,7 +51,6 @@ UNKNOWN = {
     "noisy:": "Expected an ego behind 'noisy:', such as noisy:model.zip, got 'noisy:'",
     "noisy:?latency=0.1": "Expected an ego behind 'noisy:'",
     "process:": "Expected an ego behind 'process:'",
-    ":make": "Expected module:name",
     "math:pi": r"Expected 'idm' or an object with a method predict\(observation, ...\), got float from 'math:pi'",
     "no_such_module:make": "Cannot import 'no_such_module'",
     "https://example.org/ego.zip": r"Will not load an ego from 'https://example\.org/ego\.zip': download",
@@ -142,12 +141,10 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "own_egos_for_test"
 
 
-def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str, tmp_path: Path) -> None:
+def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str) -> None:
     assert load_ego(f"{own_module}:make_rule_based") == "idm"
     assert load_ego(f"{own_module}:make_function").predict(np.zeros((2, 7), np.float32))[0].tolist() == [[0.5, 0.5]] * 2
     for function, message in (
-        ("mak", r"has nothing called 'mak' \(did you mean 'make'\?\)\."),
-        ("zzz", r"has nothing called 'zzz'\."),
         ("make_nothing", r"predict\(observation, \.\.\.\), got NoneType from 'own_egos_for_test:make_nothing'"),
         ("make_trouble", "failed to make the ego: RuntimeError: no weights"),
         ("make_exit", "failed to make the ego: SystemExit: 7"),
@@ -157,6 +154,3 @@ def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str, tm
         with pytest.raises(ValueError, match=message) as caught:
             load_ego(f"{own_module}:{function}")
         one_line(caught)
-    (tmp_path / "script_for_test.py").write_text("import sys\nsys.exit('usage: script')\n")
-    with pytest.raises(ValueError, match=r"Cannot import 'script_for_test' .*SystemExit: usage: script"):
-        load_ego("script_for_test:make")

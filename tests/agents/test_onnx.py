@@ -133,11 +133,9 @@ def test_a_network_of_plain_pytorch_drives(fixed: int | None, tmp_path: Path) ->
 
 def test_the_best_of_five_scores_is_the_action(tmp_path: Path) -> None:
     network = nn.Linear(COLUMNS, 5).requires_grad_(False)
-    ego = load_ego(write(network, tmp_path / "ego.onnx"))
+    ego, seen = load_ego(write(network, tmp_path / "ego.onnx")), torch.randn(20, COLUMNS)
+    np.testing.assert_array_equal(ego.predict(seen)[0], network(seen).argmax(dim=1))
     assert ego.action_space == spaces.Discrete(5)
-    observation = np.random.default_rng(0).normal(size=(20, COLUMNS)).astype(np.float32)
-    expected = network(torch.from_numpy(observation)).argmax(dim=1)
-    np.testing.assert_array_equal(ego.predict(observation)[0], expected)
 
 
 class Outputs(nn.Module):

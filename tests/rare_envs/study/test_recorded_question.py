@@ -56,6 +56,8 @@ def gap(moment):
 CODE = {
     "ego": {"ego": "evil:make"},
     "ego behind a stack and in a process": {"ego": "noisy:process:evil:make?timeout=5"},
+    "ego with its file": {"ego": "evil:make?file=runs/a.pt"},
+    "a driver with its file": {"drivers": "lead=evil:make?file=runs/a.pt"},
     "measure": {"measure": "evil:gap"},
     "environment": {"env_id": f"evil:{FOLLOWING}"},
     "a program elsewhere": {"ego": "noisy:tcp://127.0.0.1:9?timeout=1"},
