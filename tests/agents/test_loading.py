@@ -148,6 +148,7 @@ def test_a_function_or_module_that_does_not_serve_is_refused(own_module: str) ->
         ("make_nothing", r"predict\(observation, \.\.\.\), got NoneType from 'own_egos_for_test:make_nothing'"),
         ("make_trouble", "failed to make the ego: RuntimeError: no weights"),
         ("make_exit", "failed to make the ego: SystemExit: 7"),
+        ("make?file=a.pt", r"called with file='a\.pt', failed to make the ego: TypeError"),
         ("make_array", "got ndarray from"),
         ("drive", "called without arguments, failed to make the ego: TypeError: .*missing 1 required .*'observation'"),
     ):

@@ -265,6 +265,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("mine.txt", "")
     refuse(tmp_path / "other.zip", "not a Stable-Baselines3 model")
+    refuse(change_settings(path, policy_class={"__module__": "sbx.ppo.policies"}), "a model of sbx.* name module:func")
     (tmp_path / "folder.zip").mkdir()
     refuse(tmp_path / "folder.zip", "got the folder")
 
