@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from agents import files
 from agents.files import Provenance
@@ -26,7 +26,6 @@ from agents.learned.networks import (
     Policy,
     Scaling,
     WeightDistribution,
-    is_plain,
 )
 from agents.learned.rules import STATE_SIZE, ChangeState, CollisionAvoidance, LaneChanges, Seen
 from rare_envs.control import actions
@@ -182,11 +181,13 @@ class LearnedDriver:
 
     @property
     def recordable(self) -> bool:
-        """Whether its operations may be recorded: network, noise and rules are of this package, not of subclasses."""
-        parts = (self.colour, self.avoidance, self.changes)
-        known = (AutoregressiveNoise, CollisionAvoidance, LaneChanges)
-        ours = all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
-        return ours and is_plain(self.policy)
+        """Whether its operations may be recorded: no hooks; network, noise and rules are of this package's classes."""
+        layers = (self.policy.first, self.policy.second, self.policy.head)
+        if any(module._forward_hooks or module._forward_pre_hooks for module in (self.policy, *layers)):
+            return False
+        parts = (self.policy, *layers, self.colour, self.avoidance, self.changes)
+        known = (Policy, *[nn.Linear] * 3, AutoregressiveNoise, CollisionAvoidance, LaneChanges)
+        return all(part is None or type(part) is kind for part, kind in zip(parts, known, strict=True))
 
     def to(self, device: torch.device) -> LearnedDriver:
         """Return the driver with a copy of its network on a device."""

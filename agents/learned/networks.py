@@ -114,13 +114,6 @@ def head_weights(policy: Policy) -> Tensor:
     return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
 
 
-def is_plain(policy: Policy) -> bool:
-    """Return whether a network does what a `Policy` does: its class and layers, without hooks."""
-    modules = policy, policy.first, policy.second, policy.head
-    hooked = any(module._forward_hooks or module._forward_pre_hooks for module in modules)
-    return not hooked and tuple(map(type, modules)) == (Policy, nn.Linear, nn.Linear, nn.Linear)
-
-
 @dataclass(frozen=True)
 class AutoregressiveNoise:
     """Stationary noise with variance 1: noise_t = first noise_{t-1} + second noise_{t-2} + scale fresh_t.

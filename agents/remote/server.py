@@ -78,25 +78,21 @@ class RequestHandler:
             message = protocol.unpack(content)
             number = message["id"] if is_count(message.get("id")) else None
             demand(number is not None, "id is a whole number")
-            reply = self._answer(connection, message)
+            kind, last = message.get("type"), self._last_ids.get(connection)
+            if kind != "hello":  # which comes first; ids are higher than the last
+                if last is None:
+                    raise MalformedMessage("Expected a hello first.", "hello")
+                demand(message["id"] > last, f"expected an id above {last}, got {message['id']}")
+                self._last_ids[connection] = message["id"]
+            known = isinstance(kind, str) and kind in self._actions
+            demand(known, f"Unknown type {protocol.show(kind)}; expected {', '.join(self._actions)}.", "unknown")
+            reply = self._actions[str(kind)](connection, message)
         except MalformedMessage as error:
             reason = f"Malformed message: {error}." if error.code == "malformed" else str(error)
             reply = {"type": "error", "code": error.code, "reason": reason}
         except Exception as error:  # no request may end the server
             reply = {"type": "error", "code": "internal", "reason": reason_of(error)}
         return protocol.pack({**reply, "id": number})
-
-    def _answer(self, connection: bytes, message: Message) -> Message:
-        """Answer a request with an id; all but hello come after a hello, with an id that is higher than the last."""
-        kind, last = message.get("type"), self._last_ids.get(connection)
-        if kind != "hello":
-            if last is None:
-                raise MalformedMessage("Expected a hello first.", "hello")
-            demand(message["id"] > last, f"expected an id above {last}, got {message['id']}")
-            self._last_ids[connection] = message["id"]
-        known = isinstance(kind, str) and kind in self._actions
-        demand(known, f"Unknown type {protocol.show(kind)}; expected {', '.join(self._actions)}.", "unknown")
-        return self._actions[str(kind)](connection, message)
 
     def _hello(self, connection: bytes, message: Message) -> Message:
         """Begin a connection, and describe the ego."""

@@ -119,14 +119,11 @@ def _compare_shares(claim: PaperClaim, quantity: str, failing: FloatArray, ordin
 
 def difference_interval(first: tuple[int, int], second: tuple[int, int]) -> Interval:
     """Return the 95 % interval of a difference of two shares k of n (Newcombe 1998, method 10)."""
-    (p, low, high), (q, least, most) = (_wilson_interval(k, n) for k, n in (first, second))
+    (low, high), (least, most) = (
+        map(float, stats.binomtest(k, n).proportion_ci(0.95, method="wilson")) for k, n in (first, second)
+    )
+    p, q = (k / n for k, n in (first, second))
     return p - q - math.hypot(p - low, most - q), p - q + math.hypot(high - p, q - least)
-
-
-def _wilson_interval(k: int, n: int) -> tuple[float, float, float]:
-    """Return a share and the ends of its 95 % interval."""
-    ends = stats.binomtest(k, n).proportion_ci(0.95, method="wilson")
-    return k / n, float(ends.low), float(ends.high)
 
 
 def bootstrap_ratio(failing: FloatArray, ordinary: FloatArray) -> Interval:

@@ -192,22 +192,16 @@ def compare_with_naive(found: Mapping[str, Any], reference: Mapping[str, Any], s
         "error_ratio": (all_in, distance**2 + error**2),
         "errors_off": (distance, math.hypot(error, reference["standard_error"])),
     }
+    risk, ends = 0.0 if reference["events"] else None, None
+    if found["events"] and reference["events"]:
+        relative = relative_risk(found["events"], found["n"], reference["events"], reference["n"])
+        interval = relative.confidence_interval(0.95)
+        risk, ends = float(relative.relative_risk), (float(interval.low), float(interval.high))
     return {
         "gamma": found["gamma"],
-        **_compare_events(found, reference),
+        "events_ratio": risk,
+        "events_interval": ends,
         **{name: value / by if p > 0.0 and by > 0.0 else None for name, (value, by) in ratios.items()},
-    }
-
-
-def _compare_events(found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ratio of the shares of events, and its interval."""
-    if not found["events"] or not reference["events"]:
-        return {"events_ratio": 0.0 if reference["events"] else None, "events_interval": None}
-    risk = relative_risk(found["events"], found["n"], reference["events"], reference["n"])
-    interval = risk.confidence_interval(0.95)
-    return {
-        "events_ratio": float(risk.relative_risk),
-        "events_interval": (float(interval.low), float(interval.high)),
     }
 
 

@@ -242,18 +242,14 @@ def run_replication(job: ReplicationJob) -> Run:
         "cov": result.cov,
         "n_sim": result.n_sim,
         "simulated": problem.simulated,
-        "final": _count_final(result),
+        # draws that have a weight in p; all simulations where the points of chains stand for each other
+        "final": sum(len(part.log_weights) for part in result.draw_weights) or result.n_sim,
         "levels": len(result.trace),
         "warnings": list(result.warnings),
         "trace": _thin_trace(result),
         "level_means": means,
         "level_points": points,
     }
-
-
-def _count_final(result: Estimate) -> int:
-    """Return the draws that have a weight in p; all simulations where the points of chains stand for each other."""
-    return sum(len(part.log_weights) for part in result.draw_weights) or result.n_sim
 
 
 def _thin_trace(result: Estimate) -> list[list[float]]:
