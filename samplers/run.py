@@ -232,11 +232,12 @@ class Run:
         self._named, self._method = method, SumOfStrata(method, strata, plain_draws) if strata else method
         self.progress, self._listener = Progress(n_sim=0, max_sim=self._goal.max_sim), listener
         self._n_sim = self._n_errors = 0
-        self._failures = Failures.empty(self._inputs.dim)
+        none = np.empty((0, self._inputs.dim)), np.empty(0)
+        self._failures = Failures(*none, np.empty(0), total=0)
         self._closest = Closest(np.full(self._inputs.dim, math.nan), math.inf)
         self._failing: list[tuple[FloatArray, FloatArray]] = []  # not yet among the failures
         self._spans: list[tuple[Replicate, int, int]] = []
-        self._points: list[tuple[FloatArray, FloatArray]] | None = [] if keep_points else None
+        self._points: list[tuple[FloatArray, FloatArray]] | None = [none] if keep_points else None
         self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
@@ -413,7 +414,7 @@ class Run:
             given=self._given,
             column_names=self._column_names,
             spans=tuple((number[id(one)], n, cost) for one, n, cost in self._spans if id(one) in number),
-            points=None if self._points is None else SimulatedPoints.join(self._points, self._inputs.dim),
+            points=SimulatedPoints(*map(np.concatenate, zip(*kept, strict=True))) if (kept := self._points) else None,
         )
 
     def _find_ends(self, outcome: Outcome) -> Interval:

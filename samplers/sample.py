@@ -215,12 +215,6 @@ class SimulatedPoints:
     f: FloatArray
     """Outcomes, shape (n,); NaN if f raised or gave NaN."""
 
-    @classmethod
-    def join(cls, parts: Sequence[tuple[FloatArray, FloatArray]], dim: int) -> SimulatedPoints:
-        """Return parts x (k, d) and f (k,) as one."""
-        x, f = zip((np.empty((0, dim)), np.empty(0)), *parts, strict=True)
-        return cls(np.concatenate(x), np.concatenate(f))
-
 
 @dataclass(frozen=True, eq=False)
 class Closest:
@@ -277,11 +271,6 @@ class Failures:
     """Log density under the base distribution, shape (m,), falling."""
     total: int
     """Number of failing points that were simulated; m of them are kept here."""
-
-    @classmethod
-    def empty(cls, dim: int) -> Failures:
-        """Return no failures, of a problem with `dim` dimensions."""
-        return cls(x=np.empty((0, dim)), f=np.empty(0), log_p0=np.empty(0), total=0)
 
     def merge(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> Failures:
         """Return these failures and points x (k, d), f (k,), log_p0 (k,), the `keep` most likely of all."""
