@@ -46,27 +46,38 @@ class Hyperparameters:
     """Whether it acts by rows of `rare_envs.control.actions.DISCRETE_ACTIONS`."""
     noise: float = 0.0
     """Standard deviation of the exploration noise of a policy that has none of its own."""
+    reward_scale: float = 1.0
+    """Factor of the rewards that it learns from."""
 
 
 # A simulation step of hundreds of environments costs about as much as one of a few, so rollouts are
 # short and wide, batches large and networks small. Returns look about 5 s ahead (gamma = 0.98 at
 # 0.1 s). Exploration starts small: random steering leaves the road before braking is learnt.
+# benchmarks/training/speed.py has what epochs, gradient steps and scaled rewards cost and buy.
 _ON_POLICY = {"gamma": 0.98, "gae_lambda": 0.95}
-# Off-policy: one step of the whole batch, then this many updates.
+# Off-policy: one step of the whole batch, then so many updates.
 _OFF_POLICY = {"gamma": 0.98, "batch_size": 1024, "train_freq": 1, "gradient_steps": 8, "learning_rate": 1e-3}
 # The actor runs in every estimate, the critic not.
 _ACTOR_CRITIC = {"net_arch": {"pi": [32, 32], "vf": [64, 64]}, "log_std_init": -1.5}
 _NETS = {"net_arch": [64, 64]}
-_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 10, "learning_rate": 1e-3}
+_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 4, "clip_range": 0.3, "learning_rate": 3e-3}
+_PPO_POLICY = {**_ACTOR_CRITIC, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
 _A2C = {**_ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
-_DQN = {"exploration_fraction": 0.3, "exploration_final_eps": 0.02, "target_update_interval": 4096}
+_SAC = {**_OFF_POLICY, "gradient_steps": 2, "learning_rate": 2e-3}
+_DQN = {
+    **_OFF_POLICY,
+    "gradient_steps": 4,
+    "exploration_fraction": 0.3,
+    "exploration_final_eps": 0.02,
+    "target_update_interval": 4096,
+}
 HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Hyperparameters(_PPO, _ACTOR_CRITIC),
+        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
-        "sac": Hyperparameters(_OFF_POLICY, _NETS),
+        "sac": Hyperparameters(_SAC, _NETS),
         "td3": Hyperparameters(_OFF_POLICY, _NETS, noise=0.2),
-        "dqn": Hyperparameters({**_OFF_POLICY, **_DQN}, _NETS, discrete=True),
+        "dqn": Hyperparameters(_DQN, _NETS, discrete=True),
     }
 )
 
@@ -218,7 +229,7 @@ def train_ego(
     hyperparameters = HYPERPARAMETERS[algo]
     kind = {**split_layout(ids[0])[1], **make_kwargs}.get("action", "continuous")
     make_kwargs |= {"action": "discrete"} if hyperparameters.discrete and kind == "continuous" else {}
-    env = sb3_vec_env(ids, num_envs, even_strata=even_strata, **make_kwargs)
+    env = sb3_vec_env(ids, num_envs, even_strata=even_strata, reward_scale=hyperparameters.reward_scale, **make_kwargs)
     told = "Stopped at once: of the last steps nothing is kept."
     try:
         with use_one_thread(), _progress_bar(progress) as bar, defer_signals() as received:

@@ -25,6 +25,7 @@ def sb3_vec_env(
     num_envs: int,
     seed: int | None = None,
     even_strata: bool = False,
+    reward_scale: float = 1.0,
     **make_kwargs: Any,
 ) -> VecMonitor:
     """Open environments of ours for Stable-Baselines3: a batched simulation of each id, many episodes.
@@ -35,6 +36,8 @@ def sb3_vec_env(
         seed: Seed of the first reset; an algorithm's own seed replaces it.
         even_strata: Draw the strata of a traffic model equally often, regardless of their shares, so that a policy
             meets the rare ones: of the cutters of CutIn-v1 one in 6,000 does not look.
+        reward_scale: Factor of the rewards; a network of values learns soonest where they are about 1. What is
+            recorded of episodes is without it.
         **make_kwargs: Keyword arguments of `gym.make` for these environments, such as `action="discrete"` for DQN.
 
     Returns:
@@ -67,7 +70,7 @@ def sb3_vec_env(
     env = BatchedVecEnv(*batches)
     if seed is not None:
         env.seed(seed)
-    return VecMonitor(env)
+    return ScaledRewards(env, reward_scale)
 
 
 def _even_out(space: ScenarioSpace) -> ScenarioSpace:
@@ -127,6 +130,20 @@ def sb3_agents_env(
     return VecMonitor(env)
 
 
+class ScaledRewards(VecMonitor):
+    """Records returns and lengths of episodes, and passes the rewards on with a factor."""
+
+    def __init__(self, env: VecEnv, factor: float) -> None:
+        """Wrap an environment."""
+        super().__init__(env)
+        self.factor = np.float32(factor)
+
+    def step_wait(self) -> tuple[Any, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
+        """Advance by one step."""
+        observation, reward, done, infos = super().step_wait()
+        return observation, reward * self.factor, done, infos
+
+
 class BatchedVecEnv(VecEnv):
     """Adapter from Gymnasium `VectorEnv`s with same-step autoreset, one or several side by side, to a `VecEnv`.
 
@@ -159,7 +176,7 @@ class BatchedVecEnv(VecEnv):
         for batch, rows in zip(self.batches, self._rows, strict=True):
             options = merge_options(self._options[rows])
             observation, infos = batch.reset(seed=self._seeds[rows.start], options=options)
-            self.reset_infos += [info_row(infos, row) for row in range(batch.num_envs)]
+            self.reset_infos += info_rows(infos, range(batch.num_envs))
             observations.append(observation)
         self._reset_seeds()
         self._reset_options()
@@ -182,11 +199,12 @@ class BatchedVecEnv(VecEnv):
         observation, reward, terminated, truncated, infos = batch.step(self._actions[rows])
         done = np.logical_or(terminated, truncated)
         ends: list[dict[str, Any]] = [{} for _ in range(batch.num_envs)]
-        for row in np.flatnonzero(done).tolist():
-            ends[row] = info_row(infos.get("final_info", {}), row)
-            ends[row]["terminal_observation"] = map_kinds(np.asarray, infos["final_obs"][row])
-            ends[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
-            self.reset_infos[rows.start + row] = info_row(infos, row)
+        over = np.flatnonzero(done).tolist()
+        finals, begun = info_rows(infos.get("final_info", {}), over), info_rows(infos, over)
+        for row, final, info in zip(over, finals, begun, strict=True):
+            final["terminal_observation"] = map_kinds(np.asarray, infos["final_obs"][row])
+            final["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
+            ends[row], self.reset_infos[rows.start + row] = final, info
         return observation, np.asarray(reward, dtype=np.float32), done, ends
 
     def close(self) -> None:
@@ -264,16 +282,18 @@ def merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None
     return {name: np.stack([np.asarray(single[name]) for single in options]) for name in names}
 
 
-def info_row(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
-    """Return the info of one environment, taken out of the infos of a batch, where `_name` masks `name`.
+def info_rows(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the infos of some environments, taken out of those of a batch, where `_name` masks `name`.
 
-    `final_obs` and `final_info` belong to the episode before, not to this one.
+    `final_obs` and `final_info` belong to the episodes before, not to these.
     """
-    single: dict[str, Any] = {}
-    for name, value in infos.items():
-        mask = infos.get(f"_{name}")
-        absent = mask is not None and not mask[row]
-        if name.startswith("_") or name in ("final_obs", "final_info") or absent:
+    found: list[dict[str, Any]] = [{} for _ in rows]
+    for name, value in infos.items() if rows else ():
+        if name.startswith("_") or name in ("final_obs", "final_info"):
             continue
-        single[name] = info_row(value, row) if isinstance(value, Mapping) else value[row]
-    return single
+        parts = info_rows(value, rows) if isinstance(value, Mapping) else [value[row] for row in rows]
+        mask = infos.get(f"_{name}")
+        for row, single, part in zip(rows, found, parts, strict=True):
+            if mask is None or mask[row]:
+                single[name] = part
+    return found
