@@ -59,11 +59,10 @@ _ON_POLICY = {"gamma": 0.98, "gae_lambda": 0.95}
 _OFF_POLICY = {"gamma": 0.98, "batch_size": 1024, "train_freq": 1, "gradient_steps": 8, "learning_rate": 1e-3}
 # The actor runs in every estimate, the critic not.
 _ACTOR_CRITIC = {"net_arch": {"pi": [32, 32], "vf": [64, 64]}, "log_std_init": -1.5}
-_NETS = {"net_arch": [64, 64]}
-_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 4, "clip_range": 0.3, "learning_rate": 3e-3}
+_NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
+_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 4, "clip_range": 0.4, "learning_rate": 3e-3}
 _PPO_POLICY = {**_ACTOR_CRITIC, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
 _A2C = {**_ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
-_SAC = {**_OFF_POLICY, "gradient_steps": 2, "learning_rate": 2e-3}
 _DQN = {
     **_OFF_POLICY,
     "gradient_steps": 4,
@@ -75,7 +74,7 @@ HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
         "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
-        "sac": Hyperparameters(_SAC, _NETS),
+        "sac": Hyperparameters(_OFF_POLICY, _NETS),
         "td3": Hyperparameters(_OFF_POLICY, _NETS, noise=0.2),
         "dqn": Hyperparameters(_DQN, _NETS, discrete=True),
     }

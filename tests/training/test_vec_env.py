@@ -149,6 +149,17 @@ def test_scenarios_side_by_side_have_one_observation() -> None:
         sb3_vec_env((CUT_IN, "rare_envs/Highway-v0"), 2)
 
 
+def test_rewards_are_scaled_and_recorded_as_they_are() -> None:
+    plain, scaled = (sb3_vec_env(FOLLOWING, 2, seed=0, horizon=0.3, reward_scale=scale) for scale in (1.0, 0.02))
+    np.testing.assert_array_equal(plain.reset(), scaled.reset())
+    for _ in range(3):
+        ours, theirs = (env.step(np.zeros((2, 2), np.float32)) for env in (plain, scaled))
+        np.testing.assert_allclose(theirs[1], 0.02 * ours[1], rtol=1e-6)
+    assert theirs[2].all()
+    for mine, other in zip(ours[3], theirs[3], strict=True):
+        assert mine["episode"]["r"] == other["episode"]["r"] > 0.0
+
+
 def test_strata_are_drawn_evenly_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two strata with shares 0.99 and 0.01 each is half of the draws: a binomial count, to 5 deviations."""
     low, high = np.array([14.0, 14.0, 5.0]), np.array([16.0, 16.0, 50.0])
