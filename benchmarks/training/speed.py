@@ -10,6 +10,7 @@ with one training seed, and their intervals Student's. Writes benchmarks/results
 from __future__ import annotations
 
 import json
+import os
 import platform
 import tempfile
 import time
@@ -64,7 +65,7 @@ class Trained:
     settings: str
     seed: int
     cpu_seconds: float
-    wall_seconds: float
+    wall_seconds: float | None
     returns: tuple[float, ...]
     """Mean return of deterministic driving in each scenario trained in."""
     p: float
@@ -157,7 +158,7 @@ def write(out: Path, measured: Mapping[str, Any]) -> None:
     """Write what has been measured, and what it says."""
     about = {
         "command": "python -m benchmarks.training.speed",
-        "machine": f"{platform.machine()}, one thread",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, one thread; load {os.getloadavg()[0]:.0f}",
         "versions": {"rare_envs": rare_envs.__version__, "torch": torch.__version__},
         "settings": {"steps": STEPS, "episodes": EPISODES, "estimate": "TwoStage(), seed 0", "steps of a pair": SHORT},
         "comparisons": {case: compare(measured, case) for case in CASES},
