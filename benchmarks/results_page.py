@@ -246,48 +246,6 @@ def format_speed() -> Iterator[str]:
     )
 
 
-def format_training() -> Iterator[str]:
-    """Yield the speed of trainings, and how good their egos are."""
-    record = read("training_speed")
-    yield "## Training\n\nHow fast do egos train with the present settings, beside those of before, and are they as"
-    yield f"good? `{record['command']}`: 200,000 steps with each seed; steps by the processor's time, one thread of a"
-    yield "busy machine; means over pairs with one seed, and their 95 % intervals; p in CutIn-v0.\n"
-    yield format_table(
-        (
-            "case",
-            "steps a second",
-            "times as fast",
-            "seeds",
-            "return before",
-            "new - before",
-            "p before",
-            "new / before",
-        ),
-        (_format_training(name, case) for name, case in record["comparisons"].items() if len(case) > 1),
-    )
-
-
-def _format_training(name: str, case: Mapping[str, Any]) -> tuple[str, ...]:
-    speed = ("", "")
-    if "times as fast" in case:
-        speed = (
-            f"{case['steps per cpu second, new']:,.0f}",
-            "{:.2f} ({:.2f} to {:.2f})".format(*case["times as fast"]),
-        )
-    if case["seeds"] < 2:
-        return (f"`{name}`", *speed, *[""] * 5)
-    returns, p = case["return, new minus old"], case["p, new over old"]
-    return (
-        f"`{name}`",
-        *speed,
-        str(case["seeds"]),
-        f"{case['return, old']:.1f}",
-        "{:+.2f} ({:+.2f} to {:+.2f})".format(*returns),
-        f"{case['p, old']:.1e}",
-        "{:.2f} ({:.2f} to {:.2f})".format(*p),
-    )
-
-
 def format_page() -> str:
     """Return the page as Markdown."""
     import rare_envs
@@ -301,7 +259,6 @@ def format_page() -> str:
         format_egos(frozenset(rare_envs.ENV_IDS)),
         format_papers(),
         format_speed(),
-        format_training(),
     )
     return "\n".join([HEAD, *("\n".join(section) + "\n" for section in sections)])
 
