@@ -73,13 +73,15 @@ def train_ego_command(
     ] = True,
 ) -> Answer:
     """Train a policy in one or several scenarios, and save it for estimate --ego and risk."""
+    from rare_envs.scenarios.registry import complete_id
+    from rare_envs.study.risk import SCENARIO_SET
     from training import train_ego
     from training.ego_training import HYPERPARAMETERS
 
     seed, trust = asked.pop("seed"), asked.pop("trust")
-    ids, more = _read_environments(envs or []), dict[str, Any]()
-    data: dict[str, Any] = {}
-    next_seed = None
+    ids = tuple(map(complete_id, SCENARIO_SET if envs == ["all"] else envs or ()))
+    more: dict[str, Any] = {"even_strata": even_strata}
+    data, next_seed = dict[str, Any](), None
     if from_failures:
         from rare_envs.study.corpus import plan_retraining
 
@@ -101,15 +103,8 @@ def train_ego_command(
         world = {**asked, **{name: asked[name] or USUAL[name] for name in ("observation", "action")}}
     more |= {} if device == "cpu" else {"device": device}
     world |= {"trust": True} if trust else {}
-    settings: dict[str, Any] = {
-        "seed": seed,
-        "num_envs": num_envs,
-        "resume": resume,
-        "force": force,
-        "even_strata": even_strata,
-    }
     with as_bad_input(ValueError, OSError):
-        path = train_ego(ids, algo, steps, out=out, **settings, **more, **world)
+        path = train_ego(ids, algo, steps, seed, num_envs, out, resume=resume, force=force, **more, **world)
     of_run = {"ego": str(path), "env_id": ids[0] if len(ids) == 1 else ids, "algo": algo, "steps": steps, "seed": seed}
     world.pop("trust", None)
     data = {**of_run, **world, "even_strata": even_strata, **data}
@@ -128,14 +123,6 @@ def _advise_next(ids: Sequence[str], ego: str, world: Mapping[str, Any], seed: i
     values = {"horizon": world["horizon"], "noise": noise, "weather": "true" if world["weather"] else None}
     lines = [f"{name}: {value}" for name, value in values.items() if value not in (None, USUAL.get(name))]
     return shlex.join(words) + (f" --config FILE, with {', '.join(lines)} in the file" if lines else "")
-
-
-def _read_environments(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the ids of environments, those of `risk` for "all"."""
-    from rare_envs.scenarios.registry import complete_id, env_id_of
-    from rare_envs.study.risk import SCENARIO_SET
-
-    return tuple(map(env_id_of, SCENARIO_SET)) if [*names] == ["all"] else tuple(map(complete_id, names))
 
 
 @spread_options
