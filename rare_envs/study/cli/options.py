@@ -123,7 +123,7 @@ def command(
             parameters.append(_keyword("config", Path | None, None, Option(help=f"{text}{only}.")))
         if signature.return_annotation is not None:
             parameters.append(_keyword("as_json", JsonOption, False, None))
-        run: Any = functools.partial(run_command, Command(function, names, more, texts, (*keys, *texts), stopped))
+        run: Any = functools.partial(run_command, Command(function, names, more, texts, keys, stopped))
         run.__signature__ = inspect.Signature(parameters)
         run.__annotations__ = {each.name: each.annotation for each in parameters}
         run.__doc__, run.__name__, run.file_keys = function.__doc__, function.__name__, (*keys, *texts)

@@ -305,8 +305,8 @@ class Command(NamedTuple):
     names: Sequence[str]
     more: Sequence[str]
     texts: Sequence[str]
-    file_keys: Sequence[str]
-    """What the file of --config may have."""
+    keys: Sequence[str]
+    """What the file of --config may have beside `texts`."""
     stopped: str
 
 
@@ -323,7 +323,7 @@ def run_command(
     """Do the work of a command with what was typed and what its file says, print its answer, if any, and exit."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     typed = {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
-    filed = {} if config is None else read_question_file(config, asked.file_keys, asked.texts)
+    filed = {} if config is None else read_question_file(config, asked.keys, asked.texts)
     known: dict[str, Any] = {name: FIELDS[name].default for name in asked.more if name != "env_id"}
     known |= {name: values.pop(name) for name in asked.names}
     known |= {"noise": NOISE[known["noise"]]} if "noise" in asked.names else {}
