@@ -7,15 +7,15 @@ Crashes reported to the police are 7 to 10 times fewer.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib import resources
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 from scipy.special import chdtri, gammaincinv
 
-from rare_envs.exposure import MILLION_KM, RateInterval
+from rare_envs.exposure import MILLION_KM, CollisionRate, RateInterval
 
 __all__ = [
     "HUMAN_BENCHMARKS",
@@ -61,8 +61,12 @@ class HumanBenchmark:
 
     @property
     def interval_per_million_km(self) -> RateInterval:
-        """Exact Poisson interval of `per_million_km`, 95 %; the distance is taken as exact."""
-        tail = 0.5 - CONFIDENCE / 2
+        """`interval_at` 95 %."""
+        return self.interval_at(CONFIDENCE)
+
+    def interval_at(self, confidence: float) -> RateInterval:
+        """Return the exact Poisson interval of `per_million_km`; the distance is taken as exact."""
+        tail = 0.5 - confidence / 2
         scale = MILLION_KM / (self.miles * KM_PER_MILE)
         low = float(gammaincinv(self.count, tail)) if self.count else 0.0
         return scale * low, scale * float(chdtri(2 * self.count + 2, tail)) / 2
@@ -278,3 +282,78 @@ def calibration(event: Event, base: str) -> EventCalibration | None:
         for driver, counts in found["drivers"].items()
     }
     return EventCalibration(event=event, base=base, per_km=found["per_km"], drivers=drivers)
+
+
+MODEL, NO_HEADWAY_RULE = "human", "human:no-headway-rule"
+"""The human driver model, and the same whose glances may be longer than the headway; people need not lie between."""
+COUNTED: tuple[str, ...] = get_args(Event)
+"""Events of which people's contacts were counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventRate:
+    """Collisions of an ego in one kind of event.
+
+    Strata of a traffic model that bear the name of an event of which people's contacts were counted, such as the
+    brakings to a standstill among all, are events of their own; others are parts of the scenario's one event. The rate
+    of a part is the frequency of the scenario's events times its share times its p.
+    """
+
+    event: str
+    """One of `COUNTED`, or the name of a scenario."""
+    rate: CollisionRate
+    share: float
+    """Share of the scenario's events that are of this kind."""
+    parts: Mapping[str, float]
+    """Shares of the rate by stratum; empty if there is one stratum, or nothing failed."""
+    unresolved: Mapping[str, float] = field(default_factory=dict)
+    """Upper limits of the rate [per million km] in strata that are not resolved, see `samplers.method.Part`; that of an
+    event which is such a stratum under its own name."""
+    traffic: str
+    """The traffic model, and the options that make other traffic of it."""
+    calibration: EventCalibration | None
+    """The human driver model in this event and traffic; None if nobody has measured it."""
+
+    @property
+    def people(self) -> HumanBenchmark | None:
+        """Contacts of people in the same event; None if nobody has counted them."""
+        return count_people(self.event)
+
+    @property
+    def uncalibrated(self) -> str:
+        """Why the rate is not calibrated: the human driver model misses people, or was not measured; empty if it is."""
+        if self.calibration is None:
+            return f"no calibration of {self.traffic}"
+        return "" if self.calibration.is_calibrated else f"uncalibrated, {self.calibration.describe_factor()}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "event": self.event,
+            "share_of_events": self.share,
+            **self.rate.to_dict(),
+            "parts": dict(self.parts),
+            "unresolved": dict(self.unresolved),
+            "people": None if self.people is None else self.people.to_dict(),
+            "uncalibrated": self.uncalibrated,
+            "calibration": None if self.calibration is None else self.calibration.to_dict(),
+        }
+
+
+def count_people(event: str) -> HumanBenchmark | None:
+    """Return people's contacts in a kind of event; None if nobody has counted them."""
+    return people_in(event).contacts if event in COUNTED else None  # type: ignore[arg-type]
+
+
+def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
+    """Return people's contacts in several kinds of event together; None if one of them was not counted."""
+    return add_people([each.people for each in events])
+
+
+def add_people(counted: Sequence[HumanBenchmark | None]) -> HumanBenchmark | None:
+    """Return contacts of several kinds of event together; None if one of them was not counted."""
+    known = [each for each in counted if each is not None]
+    if not known or len(known) < len(counted):
+        return None
+    kinds = ", ".join(each.kind for each in known)
+    return replace(known[0], count=sum(each.count for each in known), kind=kinds, words="sum of the kinds of event")

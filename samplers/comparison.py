@@ -1,7 +1,7 @@
 """Comparison: the ratio of two probabilities of failure, from the same draws for both."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 
 RATIO_COARSE = "the ratio is imprecise"
 """Words of the warnings that say how imprecise the ratio is, which its interval includes."""
-ROUNDING = 1e-12
-"""Share of the largest of three sums of weights below which another is the rounding of a difference."""
+UNLIMITED = 1e6
+"""Upper over lower limit of a ratio from which on it is said to have none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,14 +89,16 @@ class Comparison(Kept):
     """A by itself."""
     b: Side
     """B by itself."""
-    both: float
-    """P[both fail]."""
+    parts: Mapping[str, Side]
+    """P[both fail], P[only A] and P[only B], by the names "both", "only_a" and "only_b"."""
     n_sim: int
     """Simulations of A and of B together."""
     warnings: tuple[str, ...]
     """Reasons for which the numbers may be wrong."""
     either: Estimate = field(repr=False)
     """P[A or B fails], from which all this comes."""
+    f: FloatArray = field(repr=False, compare=False)
+    """f of A and of B at the failures that `either` lists, shape (2, m)."""
     base_uncertainty: BaseUncertainty | None = None
     """The interval of the ratio that the events behind a fitted base allow; None for a base without refits."""
 
@@ -129,11 +131,40 @@ class Comparison(Kept):
         about: dict[str, Any] = {"includes_base": base is not None, "if_exact": if_exact, "quantity": "p_B / p_A"}
         return judge_ends(max_ratio, (low, high), self.confidence, reason, **about)
 
+    def weigh(self, values: Callable[[FloatArray], FloatArray]) -> "Comparison":
+        """Return the comparison of expected values over failures, such as injuries, in place of probabilities.
+
+        With v_A and v_B, 0 where the one does not fail, the ratio is E[v_A] / E[v_B], and the parts are E[min(v_A,
+        v_B)] of both and E[max(v_A - v_B, 0)] of A alone. Nothing is simulated but what `values` does.
+
+        Args:
+            values: Returns v_A and v_B >= 0 at points x (k, d) where A or B fails, shape (2, k).
+
+        Example:
+            >>> import samplers
+            >>> a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 3.2))
+            >>> found = samplers.compare(a, b, seed=1, max_sim=8000).weigh(lambda x: np.stack([x[:, 0] > 3.5] * 2))
+            >>> found.ratio, found.interval[0] < 1.0 < found.interval[1], found.parts["only_a"].p
+            (1.0, True, 0.0)
+        """
+        return _summarise(self.either, values, self.n_sim, self.f)
+
+    @property
+    def both(self) -> float:
+        """P[both fail]."""
+        return self.parts["both"].p
+
     @property
     def shares(self) -> dict[str, float]:
         """P[both fail], P[only A], P[only B] and P[neither], which add up to 1."""
-        only_a, only_b = (max(0.0, side.p - self.both) for side in (self.a, self.b))
-        return {"both": self.both, "only_a": only_a, "only_b": only_b, "neither": 1.0 - self.both - only_a - only_b}
+        failing = {name: side.p for name, side in self.parts.items()}
+        return {**failing, "neither": 1.0 - sum(failing.values())}
+
+    @property
+    def share_intervals(self) -> dict[str, Interval]:
+        """Intervals of `shares`, each by itself."""
+        low, high = self.either.interval
+        return {**{name: side.interval for name, side in self.parts.items()}, "neither": (1.0 - high, 1.0 - low)}
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw p of A, of B and of both with their intervals, p on a log scale; needs matplotlib.
@@ -201,8 +232,8 @@ class Comparison(Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; NaN and infinities become None."""
-        names = ("ratio", "interval", "confidence", "both", "shares", "n_sim", "warnings", "base_uncertainty", "a", "b")
-        data = {name: getattr(self, name) for name in names} | {"either": self.either.to_dict()}
+        names = ("ratio", "interval", "confidence", "both", "shares", "share_intervals", "n_sim", "warnings", "a", "b")
+        data = {name: getattr(self, name) for name in (*names, "base_uncertainty")} | {"either": self.either.to_dict()}
         return cast(dict[str, Any], to_json_value(data))
 
 
@@ -213,48 +244,62 @@ def list_ratio_facts(
 
     `a` and `b` are the names of the two, `fails` the verb of a failure, `model` what x is drawn from.
     """
-    base, sure, own = found.base_uncertainty, f"{100 * found.confidence:g} %", found.interval
-    about = {"a": a, "b": b, "fails": fails, "sure": sure}
-    ends = own if base is None else base.interval
-    limit, left_out = f"{found.n_sim:,}", ""
+    base, own = found.base_uncertainty, found.interval
+    ends, left_out = own if base is None else base.interval, ""
     if ends is None and base is not None:
         left_out = say("error not known", model=model, reason=base.reason.rstrip("."))
-    if not found._has_ratio:
-        fact = "ratio of a safe one" if found.ratio == 0 else "ratio to a safe one"
-        low, high = format_alike(*own)
-        text = say("ratio not known" if math.isnan(found.ratio) else fact, low=low, high=high, **about)
-        limit = say("limited by simulations", n=limit, few="")
-    elif ends is None:
-        ratio, low, high = format_alike(found.ratio, *own)
-        text = say("ratio without limits", ratio=ratio, **about)
-        limit = f"{base.fitted_to}{say('if the model is exact', low=low, high=high, model=model)}" if base else ""
-    else:
-        ratio, low, high = format_alike(found.ratio, *ends)
-        text = say("ratio", ratio=ratio, low=low, high=high, **about)
-        text += say("undecided which", fails=fails) if ends[0] <= 1 <= ends[1] else ""
-        limit = describe_limit(found.ratio, own, ends, limit, model, base)
+    known = None if left_out else base
+    rows = list_ratio_rows(found.ratio, own, ends, found.confidence, found.n_sim, known, model, a, b, fails)
     exact = "" if base is None else say("with an exact model", model=model)
     labels = (name if len(name) < LABEL - 1 else letter for name, letter in ((a, "A"), (b, "B")))
     sides = [(name, _describe_side(side, exact)) for name, side in zip(labels, (found.a, found.b), strict=True)]
-    rows = [("Ratio", text), ("Limited by", limit), ("Left out", left_out), *sides]
+    rows += [("Left out", left_out), *sides]
     if found._has_ratio:
-        both, first, second = format_shares([(1.0, found)])
+        both, first, second = format_sides([(side.p, side.interval) for side in found.parts.values()])
         rows.append(("Together", say("shares", both=both, a=a, first=first, b=b, second=second)))
     return [row for row in rows if row[1]]
 
 
-def format_shares(pairs: Sequence[tuple[float, Comparison]]) -> list[str]:
-    """Return P[both fail], P[only A] and P[only B], each a sum with factors; what no draw showed by its upper limit."""
-    sums, most = np.zeros(3), np.zeros(3)
-    for factor, pair in pairs:
-        sums += factor * np.array(list(pair.shares.values())[:3])
-        missed = pair.either.bound_missed(0.5 + pair.confidence / 2)
-        a, b = (min(missed, side.interval[1]) for side in (pair.a, pair.b))
-        most += factor * np.array([min(a, b), a, b])
-    seen = sums > ROUNDING * sums.max()
-    values = format_alike(*np.where(seen, sums, 0.0).tolist())
-    limits = (format_alike(float(high))[0] for high in most)
-    return [v if is_seen else f"below {high}" for v, high, is_seen in zip(values, limits, seen, strict=True)]
+def list_ratio_rows(
+    ratio: float,
+    own: Interval,
+    ends: Interval | None,
+    confidence: float,
+    n_sim: int,
+    base: BaseUncertainty | None,
+    model: str,
+    a: str,
+    b: str,
+    fails: str,
+) -> list[Row]:
+    """Return a ratio with its widest interval, `ends` (None if not known), and what limits that, in sentences.
+
+    `own` is the interval if the model of x is exact, `base` its error; the rest as in `list_ratio_facts`.
+    """
+    about = {"a": a, "b": b, "fails": fails, "sure": f"{100 * confidence:g} %"}
+    limit, (low, high) = say("limited by simulations", n=f"{n_sim:,}", few=""), ends or own
+    if math.isnan(ratio):
+        return [("Ratio", say("ratio not known", **about)), ("Limited by", limit)]
+    value, least, most = format_alike(ratio if math.isfinite(ratio) else low, low, high)
+    if ratio == 0 or (math.isinf(ratio) and low > 0):
+        fact = "ratio of a safe one" if ratio == 0 else "ratio to a safe one"
+    elif ends is None or high > UNLIMITED * low > 0 or (low <= 0 and math.isinf(high)):
+        fact = "ratio without limits"
+    elif low <= 0 or math.isinf(high):
+        fact = "ratio below" if low <= 0 else "ratio above"
+    else:
+        fact = "ratio"
+        limit = describe_limit(ratio, own, ends, f"{n_sim:,}", model, base)
+    text = say(fact, ratio=value, low=least, high=most, **about)
+    text += say("undecided which", fails=fails) if fact == "ratio" and low <= 1 <= high else ""
+    return [("Ratio", text), ("Limited by", limit)]
+
+
+def format_sides(sides: Sequence[tuple[float, Interval]]) -> list[str]:
+    """Return probabilities or rates in one form; what no draw showed by its upper limit."""
+    values = format_alike(*(p for p, _ in sides))
+    limits = (format_alike(high)[0] for _, (_, high) in sides)
+    return [v if p > 0 else f"below {high}" for (p, _), v, high in zip(sides, values, limits, strict=True)]
 
 
 def _describe_side(side: Side, exact: str) -> str:
@@ -275,9 +320,10 @@ class EitherFails:
         self.dim, self.base = int(a.dim), a.base
         self.given = ", ".join(dict.fromkeys(given for problem in (a, b) if (given := getattr(problem, "given", ""))))
         self.column_names = names_of_columns(a)
+        self.plain_draws = min(int(getattr(problem, "plain_draws", 0)) for problem in (a, b))
         self.n_sim = 0
         self._problems, self._gamma = (a, b), gamma
-        self._known: dict[bytes, tuple[bool, bool]] = {}
+        self._known: dict[bytes, tuple[float, float]] = {}
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Simulate the rows of x (n, d) with both; return the smaller outcome of each, shape (n,)."""
@@ -285,15 +331,19 @@ class EitherFails:
         self.n_sim += 2 * len(x)
         least = np.asarray(f.min(axis=0))
         for row in np.flatnonzero(least <= self._gamma):
-            self._known[x[row].tobytes()] = (bool(f[0, row] <= self._gamma), bool(f[1, row] <= self._gamma))
+            self._known[x[row].tobytes()] = (float(f[0, row]), float(f[1, row]))
         return least
 
     def failing_parts(self, x: FloatArray) -> FloatArray:
         """Return 1 if A and if B fails at points x (k, d) that were simulated, 0 elsewhere, shape (2, k)."""
+        return (self.recall(x) <= self._gamma).astype(np.float64)
+
+    def recall(self, x: FloatArray) -> FloatArray:
+        """Return f of A and of B at points x (k, d) that were simulated, inf where neither fails, shape (2, k)."""
         unknown = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
         if unknown.any():  # mapped there and back in another batch, some coordinate differs by its last bit
             self.evaluate(x[unknown])
-        return np.array([self._known.get(row.tobytes(), (False, False)) for row in x], dtype=float).reshape(-1, 2).T
+        return np.array([self._known.get(row.tobytes(), (math.inf,) * 2) for row in x]).reshape(-1, 2).T
 
 
 def compare(
@@ -362,21 +412,32 @@ def compare(
     either = estimate(
         problem, method, gamma, seed, limit, confidence=confidence, progress=progress, ensemble_run=ensemble_run
     )
-    return _summarise(either, problem)
+    found = _summarise(either, problem.failing_parts, 0, problem.recall(either.failures.x))
+    return replace(found, n_sim=problem.n_sim - (0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim))
 
 
-def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
-    """Return the comparison that the points of an estimate of P[A or B fails] give."""
+def _summarise(either: Estimate, values: Callable[[FloatArray], FloatArray], n_sim: int, f: FloatArray) -> Comparison:
+    """Return the comparison that values at the points of an estimate of P[A or B fails] give; 1 if A, if B fails."""
     sample = require_sample(either)
     fails = sample.f <= either.gamma
     weights, units = sample.weights[fails], sample.units[fails]
-    which = problem.failing_parts(sample.x)
-    totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
+    found = np.asarray(values(sample.x), dtype=np.float64).reshape(2, -1)
+    least = found.min(axis=0)
+    sums = np.zeros((5, sample.n_units))
+    for total, each in zip(sums, (*found, least, *(found - least)), strict=True):
+        total += np.bincount(units, weights * each, sample.n_units)
+    totals = sums[:2]
     # the error of the units as `_error` has it for A and B: for A = either, A has the c.o.v. of either
-    own = _error(np.bincount(units, weights=weights, minlength=sample.n_units).astype(np.float64))
+    own = _error(np.bincount(units, weights, sample.n_units).astype(np.float64))
     factor = cov_inflation(either, own / either.p if either.p > 0 else math.inf)
     single = has_independent_points(sample)
-    a, b = (_side(total, totals, factor, single, either) for total in totals)
+    most, missed = float(found.max(initial=0.0)), either.bound_missed(0.5 + either.confidence / 2)
+    a, b = (_side(total, totals, factor, single, either, most, either.interval[1]) for total in totals)
+    limits = [min(missed, side.interval[1]) for side in (a, b)]
+    both, *alone = (
+        _side(total, totals, factor, single, either, most, limit)
+        for total, limit in zip(sums[2:], (min(limits), *limits), strict=True)
+    )
     few = [
         f"{name} failed in {f'only {s.ess:.0f} effective draws' if s.ess else 'no draw'}"
         for name, s in (("A", a), ("B", b))
@@ -384,28 +445,33 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     ]
     about = [f"{' and '.join(few)}: {RATIO_COARSE}; estimate each separately."] if few else []
     for name, own, s in (("A", totals[0], a), ("B", totals[1], b)):
-        most, where = _find_missed(own, totals, either)
-        if most > UNRESOLVED_SHARE * s.p > 0:
+        above, where = _find_missed(own, totals, either)
+        if above > UNRESOLVED_SHARE * s.p > 0:
             about.append(
-                f"{name} may fail more often by up to {most:.1e} in {' and '.join(where)}: too few failures found."
+                f"{name} may fail more often by up to {above:.1e} in {' and '.join(where)}: too few failures found."
             )
-    interval, further = _ratio_interval(totals, factor, single, either), either.ensemble_run
+    interval = _ratio_interval(totals, factor, single, either)
     return Comparison(
         ratio=_ratio(a.p, b.p),
         interval=interval,
         confidence=either.confidence,
         a=a,
         b=b,
-        both=float(weights[which.astype(bool).all(axis=0)].sum()),
-        n_sim=problem.n_sim - (0 if further is None else 2 * further.n_sim),
+        parts={"both": both, "only_a": alone[0], "only_b": alone[1]},
+        n_sim=n_sim,
         warnings=(*either.warnings, *about),
         either=either,
-        base_uncertainty=_base_uncertainty(totals, factor, either, problem, interval),
+        f=f,
+        base_uncertainty=_base_uncertainty(totals, factor, either, values, interval),
     )
 
 
 def _base_uncertainty(
-    totals: FloatArray, factor: float, either: Estimate, problem: EitherFails, sampling: Interval
+    totals: FloatArray,
+    factor: float,
+    either: Estimate,
+    values: Callable[[FloatArray], FloatArray],
+    sampling: Interval,
 ) -> BaseUncertainty | None:
     """Return the uncertainty that the events leave from the unit totals of A and B, shape (2, n_units).
 
@@ -419,7 +485,7 @@ def _base_uncertainty(
     def compute_sums() -> RefitSums:
         if p_a == 0 or p_b == 0:
             raise ValueError("A or B never failed.")
-        return reweight_runs_to_refits(either, fitted.refits, lambda run: problem.failing_parts(require_sample(run).x))
+        return reweight_runs_to_refits(either, fitted.refits, lambda run: values(require_sample(run).x))
 
     cov = factor * _error(totals[0] / p_a - totals[1] / p_b) if p_a > 0 and p_b > 0 else math.inf
     about: dict[str, Any] = {"n_sim": 0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim}
@@ -439,14 +505,19 @@ def _find_missed(own: FloatArray, totals: FloatArray, either: Estimate) -> tuple
     return find_missed(either.parts, np.arange(len(own)), totals.max(axis=0), own, either.confidence)
 
 
-def _side(own: FloatArray, totals: FloatArray, factor: float, single: bool, either: Estimate) -> Side:
-    """Return the probability that the unit totals of A or of B, (n_units,) of (2, n_units), add up to."""
+def _side(
+    own: FloatArray, totals: FloatArray, factor: float, single: bool, either: Estimate, most: float, limit: float
+) -> Side:
+    """Return what unit totals (n_units,) add up to, of those of A and B (2, n_units), whose values are `most` at most.
+
+    `limit` is the upper one of a sum that is 0.
+    """
     p, ess = float(own.sum()), effective_number(own)
     if p == 0:
-        return Side(p=0.0, interval=(0.0, either.interval[1]), cov=math.inf, ess=0.0)
+        return Side(p=0.0, interval=(0.0, limit), cov=math.inf, ess=0.0)
     cov = factor * _error(own) / p
     low, high = interval_of_sum(p, cov, ess, single, either.confidence)
-    high = min(1.0, p + math.hypot(high - p, _find_missed(own, totals, either)[0]))
+    high = min(1.0, p + math.hypot(high - p, most * _find_missed(own, totals, either)[0]))
     return Side(p=p, interval=(low, high), cov=cov, ess=ess)
 
 

@@ -287,6 +287,8 @@ FACTS: Mapping[str, str] = MappingProxyType(
         "ratio to a safe one": "{a} {fails} more than {low} times as often as {b} ({sure}); no failure of {b} found",
         "ratio not known": "not known: no failure of {a} or {b} found",
         "undecided which": ": undecided which one {fails} more often",
+        "avoided": "{b} avoids {share} of the crashes of {a}: {kinds}",
+        "above people": "{name} crashes {times} times as often as people in these events",
         "side": "{p}{odds}; {low} to {high}{exact}",
         "side without a failure": "no failure found; below {high}{exact}",
         "shares": "both {both}, only {a} {first}, only {b} {second}",

@@ -1,4 +1,4 @@
-"""Evaluation of an ego, or of two, into a folder or not; an interrupted run is continued, and its size is planned.
+"""Evaluation of an ego, into a folder or not; an interrupted run is continued, and its size is planned.
 
 A sample of the simulations of a run is done again at its end, in another order and company: f is to be a function of x.
 An ego that is random after its first call, keeps a counter that nobody resets, or whose row depends on the other rows
@@ -31,11 +31,9 @@ from agents.loading import find_ego_kind, strip_prefixes
 from rare_envs.egos.needs import RULE_BASED_EGOS
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.wrappers import WrappedPolicy
-from rare_envs.files import format_json, replace_text
 from rare_envs.plugins import EgoGone, split_settings
 from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.world import rollout
-from rare_envs.startup import __version__
 from rare_envs.study import arguments, writing
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
 from rare_envs.study.ego_check import ACTION_ROUNDING
@@ -50,11 +48,9 @@ from rare_envs.study.question import (
     note_question,
     open_question,
     prepare,
-    split_question,
 )
 from rare_envs.study.report import Repeatability, Report, find_frequency
-from rare_envs.study.run_folder import BLOCKS, COMPARISON, FAILURES, RESULT_FILES, STUDY
-from rare_envs.study.text import describe_comparison
+from rare_envs.study.run_folder import RESULT_FILES, STUDY
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
@@ -63,8 +59,6 @@ from samplers.workers import ExecutorError
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 8
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
-UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity", "max_p", "max_rate")
-"""Fields of a question that a comparison does not use."""
 
 
 def run(
@@ -108,7 +102,7 @@ def run(
     if question.max_rate is not None:
         with as_bad_input(ValueError):
             find_frequency(study)
-    evaluator = _evaluator_of(study, journal, executor)
+    evaluator = make_evaluator(study, journal, executor)
     keeper = RowKeeper(study.question.gamma)
 
     def report_on(estimate: samplers.Estimate) -> Report:
@@ -145,7 +139,7 @@ def run(
         return replace(report, repeatability=recheck(study, keeper), lost=table.lost)
 
 
-def _evaluator_of(study: Study, journal: Journal | None, executor: Executor | None) -> Evaluator:
+def make_evaluator(study: Study, journal: Journal | None, executor: Executor | None) -> Evaluator:
     """Return what simulates the scenarios of a study."""
     question, problem = study.question, study.problem
     return Evaluator(
@@ -351,7 +345,7 @@ def run_into(
     begin = partial(writing.begin_journal, folder, study.question, force, whole=whole)
     with output_folder(folder, *RESULT_FILES), contextlib.closing(begin()) as journal:
         if journal.has_simulations:
-            study = _in_batches_of(journal, study)
+            study = use_batches_of(journal, study)
             writing.note_resumption(folder, journal.earlier_seconds)
         else:
             writing.begin_study_file(folder, study)
@@ -359,7 +353,7 @@ def run_into(
             return _finish(target, run(study, progress, journal, executor, target), journal, keep=bool(whole))
 
 
-def _in_batches_of(journal: Journal | None, study: Study) -> Study:
+def use_batches_of(journal: Journal | None, study: Study) -> Study:
     """Return a study in the batches in which its journal was begun."""
     if journal is None:
         return study
@@ -441,118 +435,6 @@ def _keeping(folder: Path, study: Study, journal: Journal, part: bool = False) -
     except KeyboardInterrupt as error:
         known = error if isinstance(error, RunInterrupted) else RunInterrupted("Stopped.")
         raise RunInterrupted(f"{known}{kept(known.report)}", known.report) from None
-
-
-def compare_egos(
-    question: Question,
-    ego_b: str,
-    progress: bool = False,
-    out: Path | None = None,
-    force: bool = False,
-    algo_b: str | None = None,
-    stats_b: str | None = None,
-    executor: Executor | None = None,
-    whole: Mapping[str, Any] | None = None,
-) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
-    """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end.
-
-    A part of a sum, whose name and arguments are `whole`, is continued, and keeps its journals.
-    """
-    if out is not None and not force and whole is None:
-        writing.check_no_results(out, COMPARISON)
-    questions = {"A": question, "B": replace(question, ego=ego_b, algo=algo_b, stats=stats_b)}
-    studies = {name: prepare(each) for name, each in questions.items()}
-    return _compare(studies, progress, out, force, executor, whole)
-
-
-def resume_comparison(
-    folder: Path, questions: Mapping[str, Question], trust: bool = False, executor: Executor | None = None
-) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
-    """Continue an interrupted comparison of two questions; the answer is that of an undisturbed one."""
-    opened = {
-        name: open_question(asdict(each), folder, trust, core=each.core, device=each.device)
-        for name, each in questions.items()
-    }
-    return _compare({name: prepare(each) for name, each in opened.items()}, True, folder, False, executor)
-
-
-def _compare(
-    studies: dict[str, Study],
-    progress: bool,
-    out: Path | None,
-    force: bool,
-    executor: Executor | None,
-    whole: Mapping[str, Any] | None = None,
-) -> tuple[samplers.comparison.Comparison, dict[str, Any]]:
-    """Compare the egos A and B of two studies of the same scenarios."""
-    studies = {name: settle_chunk(study, executor is not None) for name, study in studies.items()}
-    dims = [study.problem.dim for study in studies.values()]
-    if dims[0] != dims[1]:  # of the egos that are shipped, human and noisy:EGO
-        raise BadInput(
-            f"Expected two egos with the same x, got {dims[0]} and {dims[1]} dimensions, as an ego that is "
-            "random has its own in x: estimate each by itself."
-        )
-    question = studies["A"].question
-    questions = {name: study.question for name, study in studies.items()}
-    with (
-        writing.journals_of(
-            whole or {"command": "compare"}, out, questions, force, COMPARISON, FAILURES, BLOCKS
-        ) as journals,
-        contextlib.ExitStack() as stack,
-    ):
-        kept, evaluators = dict[str, RowKeeper](), dict[str, Evaluator]()
-        for name, journal in zip([*studies], journals, strict=True):
-            studies[name] = _in_batches_of(journal, studies[name])
-            evaluators[name] = _evaluator_of(studies[name], journal, executor)
-            kept[name] = RowKeeper(question.gamma)
-            evaluators[name].watchers.append(kept[name].keep)
-        try:
-            with as_bad_input(ValueError, EgoGone, ExecutorError):
-                for evaluator in evaluators.values():
-                    stack.enter_context(evaluator)
-                asked = question.run_arguments
-                found = samplers.compare(
-                    evaluators["A"],
-                    evaluators["B"],
-                    studies["A"].method,
-                    asked.gamma,
-                    asked.seed,
-                    asked.max_sim,
-                    asked.confidence,
-                    progress,
-                    ensemble_run=question.ensemble_run,
-                )
-        except samplers.EstimationInterrupted as stopped:
-            raise RunInterrupted(arguments.describe_stop(stopped.estimate, "P[A or B fails]")) from None
-        except KeyboardInterrupt:
-            raise RunInterrupted(arguments.FIRST_BATCH) from None
-        checks = {name: recheck(study, kept[name]) for name, study in studies.items()}
-        doubts = [f"{name}: {check.warning}" for name, check in checks.items() if check is not None and check.warning]
-        found = replace(found, warnings=(*found.warnings, *doubts))
-        answer = _describe_comparison(found, studies)
-        if out is not None:
-            for recorded in split_question(answer["question"]):
-                note_question(arguments.read_question(recorded))
-            with writing.unwritten_results(out, (found, answer)):
-                replace_text(out / COMPARISON, format_json(answer) + "\n")
-                writing.write_failures(out, studies["A"].problem.space, found.either.failures)
-    return found, answer
-
-
-def _describe_comparison(found: samplers.comparison.Comparison, studies: Mapping[str, Study]) -> dict[str, Any]:
-    """Return a comparison, what was asked and the verdict on its limit, as plain values for JSON."""
-    a, b = (study.question for study in studies.values())
-    inputs = {key: value for key, value in asdict(a).items() if key not in UNUSED_FIELDS}
-    verdict = None if a.max_ratio is None else found.meets(a.max_ratio, a.assume_traffic)
-    notes = [f"{name}: {note}" for name, study in studies.items() for note in study.problem.notes]
-    return {
-        **found.to_dict(),
-        "question": {"ego_a": inputs.pop("ego"), "ego_b": b.ego, **inputs, "algo_b": b.algo, "stats_b": b.stats},
-        "gate": None if verdict is None else verdict.to_dict(),
-        "notes": notes,
-        "text": [*describe_comparison(found, a, b.ego), *(f"note: {note}" for note in notes)],
-        "version": __version__,
-    }
 
 
 def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.analysis.PlannedRun, ...]:

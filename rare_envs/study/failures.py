@@ -59,12 +59,18 @@ class ReplayedFailures(NamedTuple):
 
     def severities(self, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:
         """Return delta-v [m/s] (-inf without a collision) and expected injuries of each failing point, shape (k,)."""
-        kind, known = self.crash.kind.numpy(), self.failures.has_outcome
-        counts = (kind != NONE) & (any_vehicle | (kind != OTHERS))
+        known = self.failures.has_outcome
         delta_v, injuries = np.full(len(known), -np.inf), np.zeros(len(known))
-        delta_v[known] = np.where(counts, self.crash.delta_v.double().amax(dim=1).numpy(), -np.inf)
-        injuries[known] = np.where(counts, self.crash.injury_risk.double().sum(dim=1).numpy(), 0.0)
+        delta_v[known], injuries[known] = measure_severity(self.crash, any_vehicle)
         return delta_v, injuries
+
+
+def measure_severity(crash: Crash, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:
+    """Return delta-v [m/s] (-inf without a collision) and expected injuries of B episodes, shape (B,)."""
+    kind = crash.kind.numpy()
+    counts = (kind != NONE) & (any_vehicle | (kind != OTHERS))
+    delta_v = np.where(counts, crash.delta_v.double().amax(dim=1).numpy(), -np.inf)
+    return delta_v, np.where(counts, crash.injury_risk.double().sum(dim=1).numpy(), 0.0)
 
 
 def replay_failures(

@@ -27,12 +27,11 @@ from rare_envs.envs import rendering
 from rare_envs.exposure import RateInterval, TotalRate
 from rare_envs.files import replace_file
 from rare_envs.measures import MEASURES
-from rare_envs.people import HumanBenchmark
+from rare_envs.people import EventRate, HumanBenchmark
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.study import run_folder
 from rare_envs.study.arguments import BadInput, output_file
 from rare_envs.study.episodes import draw_ordinary, list_columns
-from rare_envs.study.events import EventRate
 from rare_envs.study.replay import Drive, describe_contact, drive_again
 from rare_envs.study.report import Report
 from rare_envs.study.text import EVENT_NOUNS, format_with_interval, name_measure

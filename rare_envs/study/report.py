@@ -18,24 +18,19 @@ from rare_envs.egos.wrappers import find_inner, find_normalisation_doubt
 from rare_envs.exposure import MILLION_KM, CollisionRate, TotalRate, explain_no_frequency, normal_quantile, read_source
 from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
-from rare_envs.scenarios.registry import find_scenario
+from rare_envs.people import COUNTED, EventCalibration, EventRate, calibration
+from rare_envs.scenarios.registry import complete_id, find_scenario
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import Question
-from rare_envs.study.events import (
-    COUNTED,
-    EventRate,
-    bound_shares,
-    describe_traffic,
-    find_calibration,
-    list_part_errors,
-)
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
-from samplers.analysis.base_error import FIT_BIAS
+from samplers import analysis
+from samplers.analysis.base_error import FIT_BIAS, BaseUncertainty
 from samplers.analysis.gate import find_doubt, judge_ends, widen_ends
-from samplers.analysis.reweight import refit_quantile
+from samplers.analysis.reweight import find_fitted_base, refit_quantile
 from samplers.evaluate import Fault
 from samplers.output import say
+from samplers.problem import read_strata
 from samplers.sample import Interval
 
 N_THRESHOLDS = 25
@@ -119,6 +114,60 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> str:
 def has_exact_bound(estimate: samplers.Estimate) -> bool:
     """Return whether the answer is the upper limit, exactly: no simulation failed, and all are draws from the base."""
     return estimate.status is samplers.Status.NO_HITS and estimate.base_draws == estimate.n_sim
+
+
+def describe_traffic(study: Study) -> str:
+    """Return the traffic model of a study, and the options that make other traffic of it."""
+    changed = [name for name in ("drivers", "horizon") if getattr(study.question, name) is not None]
+    return f"{study.base_name} with {' and '.join(changed)}" if changed else study.base_name
+
+
+def find_calibration(event: str, study: Study) -> EventCalibration | None:
+    """Return the calibration of an event in the traffic of a study; None if nobody measured it.
+
+    It is that of the newest version of the scenario: the scripts of earlier ones have drivers as there are none.
+    """
+    env_id = study.question.env_id
+    newest = complete_id(find_scenario(env_id).name) == env_id.rpartition(":")[2]
+    return calibration(event, describe_traffic(study)) if newest else None  # type: ignore[arg-type]
+
+
+def bound_shares(estimate: samplers.Estimate) -> list[float]:
+    """Return the upper limit of the share of each of `estimate.parts`: no more of the events can end in a collision.
+
+    It is that of a log-normal share with the spread of the refits; the share itself if the base has none.
+    """
+    shares, fitted = [part.share for part in estimate.parts], find_fitted_base(estimate.base)
+    if fitted is None or len(fitted.refits) < 2 or fitted.clusters < 2:
+        return shares
+    of_refits = np.array([[stratum.share for stratum in read_strata(refit)] for refit in fitted.refits])
+    quantile = refit_quantile(estimate.confidence, len(of_refits) - 1, fitted.clusters)
+    largest = shares * np.exp(quantile * np.log(of_refits).std(axis=0, ddof=1))
+    return [float(each) for each in np.minimum(largest, 1.0)]
+
+
+def list_part_errors(estimate: samplers.Estimate) -> list[BaseUncertainty | None]:
+    """Return what the events behind the base leave open of share times p of each of `estimate.parts`, share included.
+
+    None if nothing failed, or the base has no refits.
+    """
+    try:
+        failures = analysis.weigh_failures(estimate)
+    except ValueError:  # nothing failed, or p is no sum over points
+        return [None] * len(estimate.parts)
+    strata, found = read_strata(estimate.base), list[BaseUncertainty | None]()
+    which = np.argmax([each.base.log_prob(failures.x) for each in strata], axis=0)  # densities are 0 in the others
+    for number, part in enumerate(estimate.parts):
+        here = (which == number).astype(np.float64)
+        own = analysis.FailureExpectation(
+            value=part.share * part.p,
+            interval=(part.share * part.interval[0], part.share * part.interval[1]),
+            confidence=estimate.confidence,
+            cov=part.cov,
+            per_failure=part.of_sum,
+        )
+        found.append(analysis.expect_under_refits(estimate, failures, here, own) if here.any() else None)
+    return found
 
 
 class Repeatability(NamedTuple):

@@ -44,6 +44,8 @@ EPISODES = "episodes.parquet"
 REPORT = "report.html"
 RISK, COMPARISON = "risk.json", "comparison.json"
 """What is in the folder of a risk, beside a run of each scenario, and in that of a comparison."""
+SIDES = ("A", "B")
+"""Of the egos of a comparison: folders of their journals, and f_A and f_B in its failures.csv."""
 ANSWER, CRASH_STRIP, SCATTER = "answer.png", "crash.png", "failures.png"
 """The number; its most likely failure from above, and failures among ordinary traffic, if there are any."""
 SENSITIVITY, SEVERITY = "sensitivity.png", "severity.png"

@@ -19,16 +19,16 @@ import samplers
 from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.measures import MEASURES
+from rare_envs.people import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.plugins import clean_text
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT, CUTTER
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.arguments import GATE_CODES, Question, read_question
 from rare_envs.study.episodes import MAX_SHOWN, Column, draw_ordinary, find_ordinary_range, format_value, list_columns
-from rare_envs.study.events import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.replay import describe_contact
 from rare_envs.study.report import MODEL_NOUN, Report, describe_left_out, explain_other_events
-from samplers.comparison import list_ratio_facts
+from samplers.comparison import UNLIMITED, list_ratio_facts
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows, format_alike, indent_lines, say
 from samplers.problem import FloatArray
 from samplers.result import list_facts, list_warnings
@@ -41,6 +41,12 @@ EVENT_NOUNS = {
     "car_following": "new leaders",
 }
 """Events, and those of scenarios, in the plural."""
+OUTCOME_NOUNS = {
+    "near_crashes": "+ near-crashes",
+    "serious_injuries": "MAIS 3+ injuries",
+    **{f"delta_v_above_{v}": f"delta-v > {v} m/s" for v in (2, 5, 10)},
+}
+"""Names of what is compared beside crashes; near-crashes come on top of these."""
 OTHER_NOUNS = {MODEL: "human driver model", "cc_human": "competent and careful driver", "idm": "IDM"}
 """Drivers that are put in the ego's place."""
 SOURCE_NOUNS = {"counts": "event counts", "sampling": "simulations"}
@@ -57,6 +63,17 @@ def format_with_interval(value: float, interval: exposure.RateInterval, unit: st
         return f"{format_rate(value)}{unit} ({level}below {format_rate(interval[1])})"
     middle, low, high = format_alike(value, *interval)
     return f"{middle}{unit} ({level}{low} to {high})"
+
+
+def format_ratio(ratio: float | None, interval: Sequence[float | None]) -> str:
+    """Return a ratio with its interval, or its one limit; None is what is not finite."""
+    low, high = interval[0] or 0.0, math.inf if interval[1] is None else interval[1]
+    if low <= 0 or math.isinf(high):
+        one = f"below {format_rate(high)}" if low <= 0 else f"above {format_rate(low)}"
+        return "not known" if low <= 0 and math.isinf(high) else one
+    if high > UNLIMITED * low:
+        return f"{format_rate(ratio or 0.0)} (no limits)"
+    return format_with_interval(ratio or 0.0, (low, high))
 
 
 def format_share(share: float) -> str:
@@ -80,11 +97,11 @@ def describe_injuries(rate: exposure.CollisionRate | exposure.TotalRate) -> str:
     return say("serious injuries", rate=found)
 
 
-def describe_people(counted: people.HumanBenchmark | None) -> str:
+def describe_people(counted: people.HumanBenchmark | None, confidence: float) -> str:
     """Return people's contacts per million km with their interval."""
     if counted is None:
         return "not counted"
-    return format_with_interval(counted.per_million_km, counted.interval_per_million_km)
+    return format_with_interval(counted.per_million_km, counted.interval_at(confidence))
 
 
 def describe_rate(each: EventRate) -> str:
@@ -152,10 +169,12 @@ def tabulate_events(events: Sequence[EventRate], total: exposure.TotalRate | Non
         p = f"{'' if rate.p > 0 and resolved else 'below '}{min(found / each.share, 1.0):.1e}"
         numbers = format_rate(rate.frequency.per_km * each.share), p
         name = name_event(each).removesuffix(" of the lead")  # a row of less than a hundred columns
-        rows.append((name, *numbers, describe_rate(each), describe_people(each.people), describe_model(each)))
+        rows.append(
+            (name, *numbers, describe_rate(each), describe_people(each.people, rate.confidence), describe_model(each))
+        )
     if total is not None:
         whole = format_with_interval(total.per_million_km, total.interval_per_million_km)
-        rows.append(("all", "", "", whole, describe_people(sum_people(events)), ""))
+        rows.append(("all", "", "", whole, describe_people(sum_people(events), total.confidence), ""))
     head, *lines = tabulate(rows)
     vague = ({name: end for name, end in each.unresolved.items() if name != each.event} for each in events)
     below = (describe_parts(each.parts, ends) for each, ends in zip(events, vague, strict=True))
@@ -260,6 +279,18 @@ def explain_comparison(found: Result) -> list[str]:
     ]
 
 
+def explain_compared_risks(found: Result) -> list[str]:
+    """Return what a comparison summed over scenarios means and what not, in sentences."""
+    nouns = " and ".join(EVENT_NOUNS.get(name, name) for name in found["scenarios"])
+    return [
+        f"Both egos drove the same simulated {nouns}. The probability of each outcome is multiplied by how often such "
+        "events were counted per km, and the products are added.",
+        "Near-crashes need a rapid manoeuvre, and include crashes; injuries are serious ones (MAIS 3 "
+        "or more) of both vehicles.",
+        "A kind of failure that no simulation of either came near would not have been seen.",
+    ]
+
+
 def _log_width(ends: Sequence[float | None] | None) -> float:
     """Return the width of an interval of a logarithm; infinite if an end is not known."""
     low, high = ends or (None, None)
@@ -358,12 +389,38 @@ def describe_answer(report: Report, last: Sequence[Row] = (), most: int = MOST_L
     return [*head, *fold_rows([*rows, *list_warnings(report.warnings), *last], most - len(head))]
 
 
-def describe_comparison(found: samplers.comparison.Comparison, question: Question, ego_b: str) -> list[str]:
-    """Return the comparison of a question's ego with another one in at most `MOST_LINES` - 1 lines."""
-    a, b = (Path(ego).name if Path(ego).suffix else ego for ego in (question.ego, ego_b))
+def describe_comparison(
+    found: samplers.comparison.Comparison, question: Question, ego_b: str, kinds: Mapping[str, tuple[float, float]]
+) -> list[str]:
+    """Return the comparison of a question's ego with another one in at most `MOST_LINES` - 1 lines.
+
+    `kinds` are as in `list_avoided`.
+    """
+    a, b = shorten_egos(question.ego, ego_b)
     fails = "crashes" if name_p(question) == CRASHES else "fails"
-    rows = [*list_ratio_facts(found, a, b, fails, MODEL_NOUN), *list_warnings(found.all_warnings)]
-    return [f"{a} (A) against {b} (B) in {question.env_id}", *fold_rows(rows, MOST_LINES - 2)]
+    rows = [*list_ratio_facts(found, a, b, fails, MODEL_NOUN), *list_avoided(kinds, a, b)]
+    return [
+        f"{a} (A) against {b} (B) in {question.env_id}",
+        *fold_rows([*rows, *list_warnings(found.all_warnings)], MOST_LINES - 2),
+    ]
+
+
+def shorten_egos(*egos: str) -> list[str]:
+    """Return the names of egos, of files without their folders."""
+    return [Path(ego).name if Path(ego).suffix else ego for ego in egos]
+
+
+def list_avoided(kinds: Mapping[str, tuple[float, float]], a: str, b: str) -> list[Row]:
+    """Return which of A's crashes B avoids: of how often A has a kind of crash, and how often B then has none."""
+    whole = sum(each for each, _ in kinds.values())
+    if not whole > 0:
+        return []
+    share = format_share(sum(avoided for _, avoided in kinds.values()) / whole)
+    named = {kind: each for kind, each in kinds.items() if each[0] > NAMED_SHARE * whole}
+    parts = [f"{format_share(less / own)} of {describe_kind(kind)}" for kind, (own, less) in named.items()]
+    if len(named) > 1:
+        parts = [f"{part} ({format_share(own / whole)})" for part, (own, _) in zip(parts, named.values(), strict=True)]
+    return [("Avoided", say("avoided", a=a, b=b, share=share, kinds=", ".join(parts)))]
 
 
 def report_as_json(report: Report) -> dict[str, Any]:
@@ -435,7 +492,7 @@ def _list_rates(report: Report) -> Iterator[Row]:
         yield "Rate", report.no_rate
         return
     found = format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
-    injuries, counted = report.injury_rate, describe_people(sum_people(events))
+    injuries, counted = report.injury_rate, describe_people(sum_people(events), rate.confidence)
     nouns = [name_event(each) for each in events]
     if len(events) == 1:
         yield "Rate", say("rate", rate=found, noun=nouns[0], people=counted)
@@ -446,7 +503,7 @@ def _list_rates(report: Report) -> Iterator[Row]:
     yield "Rate", say("rate of all", rate=found, people=counted)
     for noun, each in zip(nouns, events, strict=True):
         model = f"{describe_model(each)}{', not calibrated' if each.uncalibrated else ''}"
-        counted = describe_people(each.people)
+        counted = describe_people(each.people, rate.confidence)
         yield "of which", say("rate of one", noun=noun, rate=describe_rate(each), people=counted, model=model)
 
 

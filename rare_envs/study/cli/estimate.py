@@ -300,14 +300,15 @@ def compare_command(
         raise BadInput(
             f"Expected two egos before the scenario {scenario}: rare-envs compare old.zip new.zip {scenario}."
         )
-    asked["max_sim"] = asked["max_sim"] or PAIR_SIMULATIONS
     how: dict[str, Any] = {"out": out, "progress": True, "force": force, "executor": executor}
     how |= {"algo_b": algo_b, "stats_b": stats_b}
     if env is not None:
-        from rare_envs.study.evaluate import compare_egos
+        from rare_envs.study.comparison import compare_egos
 
+        asked["max_sim"] = asked["max_sim"] or PAIR_SIMULATIONS
         return tell(compare_egos(_ask(env, {**asked, "ego": ego_a}), ego_b, **how), out, details)
-    from rare_envs.study.risk import SCENARIO_SET, compare_risks
+    from rare_envs.study.comparison import compare_risks
+    from rare_envs.study.risk import SCENARIO_SET
 
     base = asked.pop("base")
     with as_bad_input(ValueError):
@@ -328,7 +329,7 @@ def resume_command(
     details: options.DetailsOption = False,
 ) -> Answer:
     """Continue an interrupted estimate, risk or compare; the result is the same as without the interruption."""
-    from rare_envs.study import evaluate, writing
+    from rare_envs.study import comparison, evaluate, writing
 
     trust = asked["trust"]
     folder, whole, questions = writing.find_whole(run, mend)
@@ -343,9 +344,9 @@ def resume_command(
         opened = open_question(asdict(question), folder, trust, core=question.core, device=question.device)
         return estimate_highway_env(opened, whole["env_config"], folder, False, details, executor)
     if whole["command"] == "compare":
-        return tell(evaluate.resume_comparison(folder, questions, trust, executor), folder, details)
-    from rare_envs.study.risk import resume_compared_risks, resume_risk
+        return tell(comparison.resume_comparison(folder, questions, trust, executor), folder, details)
+    from rare_envs.study.risk import resume_risk
 
-    resume = resume_compared_risks if whole["command"] == writing.SUM else resume_risk
+    resume = comparison.resume_compared_risks if whole["command"] == writing.SUM else resume_risk
     with as_bad_input(ValueError):
         return tell(resume(folder, questions, whole, trust=trust, executor=executor), folder, details)

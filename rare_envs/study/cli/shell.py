@@ -282,7 +282,7 @@ def tell(found: Any, out: Path | None = None, details: bool = False) -> Answer:
         show, verdict = functools.partial(print_report, found, out, details), found.verdict
         return Answer(report_as_json(found), show, _find_code(verdict, found.doubtful))
     if isinstance(found, tuple):
-        compared, data = found
+        compared, _, data = found
         limit, exact = (data["question"][name] for name in ("max_ratio", "assume_traffic"))
         verdict = None if limit is None else compared.meets(limit, exact)
         more = ["", compared.details(), "", compared.either.details()] if details else []

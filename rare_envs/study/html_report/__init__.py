@@ -35,6 +35,7 @@ from rare_envs.study.run_folder import (
     REPORT,
     RESULT,
     RISK,
+    SIDES,
     STUDY,
     LoadedStudy,
     load_finished,
@@ -87,10 +88,6 @@ def find_nearest_event(x: FloatArray, events: FloatArray, ordinary: FloatArray) 
 
 MOST_MODES, LEAST_SHOWN = 8, 0.01
 """Modes of a run that are shown with pictures, and the share that these have; the others have a line each."""
-MOST_COMPARED = 1000
-"""Failures of a comparison that both egos drive again, the most likely ones."""
-ROUNDING = 1e-9
-"""Largest difference of two sums of weights, as a share of them, that is rounding."""
 CLIP_SECONDS = 3.0
 """Seconds that a clip shows, the last ones up to the end of the drive."""
 
@@ -361,31 +358,76 @@ def _describe_risk(folder: Path, trust: bool) -> dict[str, Any]:
 
 
 def _describe_comparison(folder: Path, trust: bool) -> dict[str, Any]:
-    """Return what the page says of a comparison: its ratio, and the most likely failures as both egos drive them."""
+    """Return what the page says of a comparison in one scenario, or of one that is summed over several."""
     with as_bad_input(OSError, ValueError):
         found = parse_json_object(read_text_file(folder / COMPARISON), COMPARISON)
-        if "question" not in found and isinstance(found.get("scenarios"), dict):
-            parts = ", ".join(str(folder / str(name)) for name in found["scenarios"])
-            raise ValueError(f"{str(folder)!r} sums several comparisons: expected the folder of one, {parts}.")
+    with _damage_as_bad_input(folder):
+        if "question" in found:
+            pair = _describe_pair(folder, found, trust)
+            return {**pair, "runs": {"": pair}}
+        names = [str(name) for name in found["scenarios"]]
+    runs = {}
+    for name in names:
+        with as_bad_input(OSError, ValueError):
+            part = parse_json_object(read_text_file(folder / name / COMPARISON), COMPARISON)
+        runs[name] = _describe_pair(folder / name, part, trust, f"{name}-")
+    with _damage_as_bad_input(folder):
+        return {
+            "title": f"{found['ego_a']} (A) against {found['ego_b']} (B)",
+            "result": found,
+            "answer": found["text"],
+            "meaning": text.explain_compared_risks(found),
+            "doubts": [str(each) for each in found["warnings"]],
+            "outcomes": list_outcomes({"crashes": found, **found["outcomes"]}),
+            "avoided": list_avoided(found["kinds_of_a"]),
+            "runs": runs,
+            "drawn": [each for run in runs.values() for each in run["drawn"]],
+        }
+
+
+def list_outcomes(found: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return a row for each outcome: its name, A, B and A / B, then both, only A and only B, each with its interval."""
+    rows = []
+    for name, each in found.items():
+        if "per_million_km" in each:
+            sides = [(rate, each["intervals_per_million_km"][key]) for key, rate in each["per_million_km"].items()]
+        else:
+            sides = [(each[key]["p"], each[key]["interval"]) for key in "ab"]
+            sides += [(p, each["share_intervals"][key]) for key, p in each["shares"].items() if key != "neither"]
+        a, b, *shares = (text.format_with_interval(value, ends) for value, ends in sides)
+        ratio = text.format_ratio(each["ratio"], each["interval"])
+        rows.append((text.OUTCOME_NOUNS.get(name, name), a, b, ratio, *shares))
+    return rows
+
+
+def list_avoided(kinds: Mapping[str, Mapping[str, float]]) -> list[tuple[str, float, float]]:
+    """Return kinds of crash of A with their shares of all, and the share of each that B avoids."""
+    sizes = {kind: next(iter(each.values())) for kind, each in kinds.items()}
+    return [(kind, size / sum(sizes.values()), kinds[kind]["avoided_by_b"]) for kind, size in sizes.items()]
+
+
+def _describe_pair(folder: Path, found: Mapping[str, Any], trust: bool, prefix: str = "") -> dict[str, Any]:
+    """Return what the page says of a pair of egos in a scenario: their ratio, and the most likely failures of both."""
+    with as_bad_input(OSError, ValueError):
         table = read_failures(folder)
     questions = [open_question(each, folder, trust) for each in split_question(found.get("question"))]
     problems = [prepare(question).problem for question in questions]
     with _damage_as_bad_input(folder):
-        gamma, p, shown = float(found["either"]["gamma"]), float(found["either"]["p"]), list[Any]()
-        x = np.array([read_row(table, problems[0], k) for k in range(min(len(table["f"]), MOST_COMPARED))])
-        fails = [problem.evaluate(x) <= gamma if len(x) else np.empty(0, dtype=bool) for problem in problems]
-        columns, alone = list_columns(problems[0].space), [found[name]["p"] - found["both"] for name in "ab"]
+        gamma, shown, columns = float(found["either"]["gamma"]), list[Any](), list_columns(problems[0].space)
+        fails = [~(table[f"f_{ego}"] > gamma) for ego in SIDES]  # NaN: it gave no answer, which counts as a failure
         outcomes = {
-            "Both fail": (fails[0] & fails[1], found["both"]),
-            "Only A fails": (fails[0] & ~fails[1], alone[0] if alone[0] > ROUNDING * p else 0.0),
-            "Only B fails": (fails[1] & ~fails[0], alone[1] if alone[1] > ROUNDING * p else 0.0),
+            "Both fail": fails[0] & fails[1],
+            "Only A fails": fails[0] & ~fails[1],
+            "Only B fails": fails[1] & ~fails[0],
         }
-        for said, (rows, _) in outcomes.items():
-            for k in np.flatnonzero(rows)[:1]:
+        for said, rows in outcomes.items():
+            for k in np.flatnonzero(rows)[:1].tolist():
+                x = read_row(table, problems[0], k)
                 drives = [
-                    _show_drive(problem, x[k], f"failure{k}-{ego}") for problem, ego in zip(problems, "AB", strict=True)
+                    _show_drive(problem, x, f"{prefix}failure{k}-{ego}")
+                    for problem, ego in zip(problems, SIDES, strict=True)
                 ]
-                values = [(column, value) for column, value in zip(columns, x[k], strict=True) if column.shown]
+                values = [(column, value) for column, value in zip(columns, x, strict=True) if column.shown]
                 shown.append((said, int(rows.sum()), values, drives))
         return {
             "title": f"{questions[0].ego} (A) against {questions[1].ego} (B) in {questions[0].env_id}",
@@ -393,9 +435,11 @@ def _describe_comparison(folder: Path, trust: bool) -> dict[str, Any]:
             "answer": found["text"],
             "meaning": text.explain_comparison(found),
             "doubts": [str(each) for each in found["warnings"]],
-            "outcomes": {said: share for said, (_, share) in outcomes.items()} | {"Neither fails": 1 - p},
+            "fail": dict(zip([*outcomes, "Neither fails"], found["shares"].values(), strict=True)),
+            "outcomes": list_outcomes({"failures": found, **found["severity"]}),
+            "avoided": list_avoided(found["kinds_of_a"]),
             "shown": shown,
-            "n_listed": len(x),
+            "n_listed": len(table["f"]),
             "drawn": [each for *_, drives in shown for drive in drives for each in drive.figures],
         }
 
