@@ -41,7 +41,7 @@ from rare_envs.traffic.crash import CRASH_KINDS, NONE, OTHERS
 from samplers.analysis.gate import find_doubt, judge_ends
 from samplers.comparison import RATIO_COARSE, Comparison, Side, format_sides, list_ratio_rows
 from samplers.evaluate import Evaluator, Executor
-from samplers.output import MOST_LINES, WIDTH, Row, fold_rows, say
+from samplers.output import LABEL, MOST_LINES, WIDTH, Row, fold_rows, say
 from samplers.problem import FloatArray
 from samplers.result import list_warnings
 from samplers.workers import ExecutorError

@@ -12,9 +12,11 @@ References:
 from __future__ import annotations
 
 import io
+import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,6 +49,11 @@ DISCLAIMER = (
     "This folder documents a simulation study. It is no conformity assessment and no approval, and it does not "
     "replace the judgement of a technical service."
 )
+_SCHEMA = resources.files("rare_envs") / "data" / "evidence_schema.json"
+SCHEMA: dict[str, Any] = json.loads(_SCHEMA.read_text("utf-8"))
+    resources.files("rare_envs").joinpath("data/evidence_schema.json").read_text("utf-8")
+)
+"""JSON schema of all files of the evidence together, {name: content}."""
 N_COMPARED = 1_000
 """Ordinary scenarios that both simulators drive."""
 MOST_CASES = 20
@@ -537,71 +544,3 @@ def render(study: LoadedStudy, content: Mapping[str, Any], picture: str) -> str:
         **{name.removesuffix(".json"): value for name, value in content.items()},
     )
     return clean_text(page)
-
-
-_TEXT, _NUMBER = {"type": "string"}, {"type": ["number", "null"]}
-_STATUS = {"enum": ["supported", "not supported", "not known", None]}
-
-
-def _object(required: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of an object with these entries."""
-    return {"type": "object", "required": list(required), "properties": dict(required)}
-
-
-def _list(items: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": items}
-
-
-_NODE = _object({"id": _TEXT, "kind": _TEXT, "text": _TEXT, "status": _STATUS})
-
-SCHEMA: dict[str, Any] = {
-    "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": "Evidence of a run: its files by name",
-    **_object(
-        {
-            COVERAGE: _object(
-                {
-                    "statement": _TEXT,
-                    "scenario": _TEXT,
-                    "iso_34502": _object({"covered": _list({"enum": list(CELLS)}), "not_covered": _list(_TEXT)}),
-                    "operational_design_domain": {"type": "object"},
-                    "parameters": _list(_object({"name": _TEXT, "unit": _TEXT, "central_90_percent": _list(_NUMBER)})),
-                }
-            ),
-            UNCERTAINTY: _object(
-                {
-                    "p": {"type": "number", "minimum": 0, "maximum": 1},
-                    "sources": {
-                        **_list(_object({"source": _TEXT, "interval_of_p": _list(_NUMBER), "pointer": _TEXT})),
-                        "minItems": 3,
-                    },
-                    "calibration": _list({"type": "object"}),
-                }
-            ),
-            VALIDATION: _object({"replays": _object({"compared": {"type": "integer"}}), "simulators": _object({})}),
-            TRAFFIC: _object({"name": _TEXT, "kind": _TEXT, "checks": _list({"type": "object"})}),
-            TEST_CASES: _object(
-                {
-                    "cases": _list(
-                        _object(
-                            {
-                                "id": _TEXT,
-                                "objective": _TEXT,
-                                "parameters": {"type": "object"},
-                                "initial_conditions": {"type": "object"},
-                                "expected_result": _TEXT,
-                                "actual_result": {"type": "object"},
-                                "files": {**_list(_TEXT), "minItems": 2},
-                            }
-                        )
-                    )
-                }
-            ),
-            MANIFEST: _object({"command": {"type": ["string", "null"]}, "blake2b": {"type": "object"}}),
-            CLAIMS: _object(
-                {"disclaimer": _TEXT, "nodes": _list(_object({"id": _TEXT, "text": _TEXT, "status": _STATUS}))}
-            ),
-        }
-    ),
-}
-"""JSON schema of all files of the evidence together, {name: content}."""
