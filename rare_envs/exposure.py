@@ -123,6 +123,11 @@ class CollisionRate:
         return self.p > 0 and (self.interval is None or self.interval[0] > 0)
 
     @property
+    def limited(self) -> bool:
+        """Whether the rate has a limit: an upper one below the rate of the events, or a lower one."""
+        return self.determined or self.interval is None or self.interval[1] < 1.0
+
+    @property
     def log_variance(self) -> dict[str, float]:
         """Parts of the variance of log R.
 
@@ -279,6 +284,11 @@ class TotalRate:
     def determined(self) -> tuple[CollisionRate, ...]:
         """The rates with an interval on both sides."""
         return tuple(rate for rate in self.rates if rate.determined)
+
+    @property
+    def limited(self) -> bool:
+        """Whether all of the rates are."""
+        return all(rate.limited for rate in self.rates)
 
     @cached_property
     def shares(self) -> tuple[VarianceShare, ...]:

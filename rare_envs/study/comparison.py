@@ -513,7 +513,7 @@ class RiskComparison(RateComparison):
         counted, sides = self.people, list[str]()
         for name, letter, rate in zip((a, b), SIDES, self.rates.values(), strict=False):
             name = name if len(name) < LABEL - 1 else letter
-            sides.append(f"{name} {text.format_with_interval(rate.per_million_km, rate.interval_per_million_km)}")
+            sides.append(f"{name} {text.format_events(rate)}")
         sides.append(f"people in the same events {text.describe_people(counted, self.confidence)}")
         rows.append(("Crash rates", ", ".join(sides)))
         for name, ego, rate in zip((a, b), (self.ego_a, self.ego_b), self.rates.values(), strict=False):

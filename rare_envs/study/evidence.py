@@ -51,8 +51,6 @@ DISCLAIMER = (
 )
 _SCHEMA = resources.files("rare_envs") / "data" / "evidence_schema.json"
 SCHEMA: dict[str, Any] = json.loads(_SCHEMA.read_text("utf-8"))
-    resources.files("rare_envs").joinpath("data/evidence_schema.json").read_text("utf-8")
-)
 """JSON schema of all files of the evidence together, {name: content}."""
 N_COMPARED = 1_000
 """Ordinary scenarios that both simulators drive."""

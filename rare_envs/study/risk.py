@@ -138,7 +138,7 @@ class ScenarioRisk:
             "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
-            "report": text.report_as_json(self.report),
+            "report": self.report.to_dict(),
         }
 
 
@@ -221,7 +221,7 @@ class Risk:
         """Return the lines of the answer, at most so many beside the table; `last` are facts before the verdict."""
         total, kinds, counted = self.total, self.kinds, self.people
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
-        per_km = text.format_with_interval(total.per_million_km, total.interval_per_million_km, "", level)
+        per_km = text.format_events(total, "", level)
         beside = "" if counted is None else f"; people {text.describe_people(counted, total.confidence)}"
         parts = (f"{text.format_share(r / whole)} {text.describe_kind(kind)}" for kind, r in kinds.items() if whole)
         rows = {

@@ -91,10 +91,16 @@ def name_event(each: EventRate) -> str:
     return EVENT_NOUNS.get(each.event, each.event)
 
 
+def format_events(rate: exposure.CollisionRate | exposure.TotalRate, unit: str = "", level: str = "") -> str:
+    """Return a rate of collisions with its interval; a limit that is no less than the rate of the events is none."""
+    if rate.limited:
+        return format_with_interval(rate.per_million_km, rate.interval_per_million_km, unit, level)
+    return f"{format_rate(rate.per_million_km)}{unit} ({level}no lower or upper limit)"
+
+
 def describe_injuries(rate: exposure.CollisionRate | exposure.TotalRate) -> str:
     """Return a rate of serious injuries with its interval."""
-    found = format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
-    return say("serious injuries", rate=found)
+    return say("serious injuries", rate=format_events(rate, " per million km"))
 
 
 def describe_people(counted: people.HumanBenchmark | None, confidence: float) -> str:
@@ -106,10 +112,9 @@ def describe_people(counted: people.HumanBenchmark | None, confidence: float) ->
 
 def describe_rate(each: EventRate) -> str:
     """Return the rate of an event per million km with its interval, or its upper limit if too few failed."""
-    ends = each.rate.interval_per_million_km
-    if each.event in each.unresolved:
-        return f"below {format_rate(ends[1])}"
-    return format_with_interval(each.rate.per_million_km, ends)
+    if each.event in each.unresolved and each.rate.limited:
+        return f"below {format_rate(each.rate.interval_per_million_km[1])}"
+    return format_events(each.rate)
 
 
 def describe_model(each: EventRate) -> str:
@@ -173,7 +178,7 @@ def tabulate_events(events: Sequence[EventRate], total: exposure.TotalRate | Non
             (name, *numbers, describe_rate(each), describe_people(each.people, rate.confidence), describe_model(each))
         )
     if total is not None:
-        whole = format_with_interval(total.per_million_km, total.interval_per_million_km)
+        whole = format_events(total)
         rows.append(("all", "", "", whole, describe_people(sum_people(events), total.confidence), ""))
     head, *lines = tabulate(rows)
     vague = ({name: end for name, end in each.unresolved.items() if name != each.event} for each in events)
@@ -423,11 +428,6 @@ def list_avoided(kinds: Mapping[str, tuple[float, float]], a: str, b: str) -> li
     return [("Avoided", say("avoided", a=a, b=b, share=share, kinds=", ".join(parts)))]
 
 
-def report_as_json(report: Report) -> dict[str, Any]:
-    """Return a report as values of JSON, with the whole answer as `text`."""
-    return {**report.to_dict(), "text": [*describe_answer(report, most=WHOLE), *list_gate(report.verdict)]}
-
-
 def name_p(question: Question) -> str:
     """Return what a question counts."""
     if not explain_other_events(question):
@@ -491,7 +491,7 @@ def _list_rates(report: Report) -> Iterator[Row]:
     if rate is None:
         yield "Rate", report.no_rate
         return
-    found = format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
+    found = format_events(rate, " per million km")
     injuries, counted = report.injury_rate, describe_people(sum_people(events), rate.confidence)
     nouns = [name_event(each) for each in events]
     if len(events) == 1:
@@ -558,7 +558,7 @@ def _list_all_rates(report: Report) -> Iterator[Row]:
     rate, injuries = report.rate, report.injury_rate
     if rate is None:
         return
-    yield "collisions", format_with_interval(rate.per_million_km, rate.interval_per_million_km, " per million km")
+    yield "collisions", format_events(rate, " per million km")
     yield from (("", line) for line in tabulate_events(report.events))
     events = f"{format_rate(rate.frequency.per_km)} {EVENT_NOUNS.get(rate.scenario, 'events')} per km"
     yield "", "; ".join(filter(None, [f"from {events}", describe_uncertainty(exposure.TotalRate((rate,)))]))

@@ -334,7 +334,10 @@ def resume_command(
     trust = asked["trust"]
     folder, whole, questions = writing.find_whole(run, mend)
     if whole and (ego or on_error):
-        raise BadInput(f"Expected --ego and --on-error with a run of rare-envs estimate; {str(run)!r} has another.")
+        raise BadInput(
+            f"--ego and --on-error are for a run of rare-envs estimate, and {str(run)!r} is of {whole['command']}: "
+            "resume it without them, or begin again with --force."
+        )
     if not whole:
         return tell(evaluate.resume(run, ego, on_error, trust, progress=True, executor=executor), run, details)
     if whole["command"] == "estimate":
