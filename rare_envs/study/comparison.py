@@ -288,6 +288,9 @@ class RateComparison:
             )
             low, high = side.p / below, side.p * above
         else:
+            if (pair.a.p > 0) != (pair.b.p > 0):  # the ratio says how rare the failures of the other are
+                least, most = pair.interval
+                high = min(high, pair.a.p / max(least, LEAST) if pair.a.p > 0 else pair.b.p * most)
             high *= math.exp(of_traffic)
         return exposure.CollisionRate(
             scenario=name,
@@ -476,7 +479,7 @@ class RiskComparison(RateComparison):
         """Return the answer, for people: the ratio, what limits it, the rates by outcome, and last the verdict."""
         return "\n".join(self.describe())
 
-    def describe(self, last: Sequence[Row] = (), most: int = MOST_LINES) -> list[str]:
+    def describe(self, last: Sequence[Row] = (), most: int = MOST_LINES + 2) -> list[str]:
         """Return the lines of the answer, about so many; `last` are facts before the verdict."""
         a, b = text.shorten_egos(self.ego_a, self.ego_b)
         gate, names = text.list_gate(self.verdict), " and ".join(map(text.name_scenario, self.scenarios))
@@ -484,7 +487,7 @@ class RiskComparison(RateComparison):
         more = [*text.list_avoided(self.kinds, a, b), *list_warnings(self.warnings), *last]
         table = self.tabulate_outcomes((CRASHES, NEAR_CRASHES, INJURIES))
         left = most - 1 - len(table) - len(gate)
-        facts, rest = fold_rows(self._list_facts(a, b), left - len(more)), fold_rows(more, max(left - 4, len(more)))
+        facts, rest = fold_rows(self._list_facts(a, b), left - len(more)), fold_rows(more, max(left - 5, len(more)))
         return [title, *facts, *table, *rest, *gate]
 
     def tabulate_outcomes(self, names: Sequence[str] = ()) -> list[str]:
@@ -514,7 +517,7 @@ class RiskComparison(RateComparison):
         for name, letter, rate in zip((a, b), SIDES, self.rates.values(), strict=False):
             name = name if len(name) < LABEL - 1 else letter
             sides.append(f"{name} {text.format_events(rate)}")
-        sides.append(f"people in the same events {text.describe_people(counted, self.confidence)}")
+        sides.append(f"people {text.describe_people(counted, self.confidence)}")
         rows.append(("Crash rates", ", ".join(sides)))
         for name, ego, rate in zip((a, b), (self.ego_a, self.ego_b), self.rates.values(), strict=False):
             above = 0.0 if counted is None else rate.per_million_km / counted.interval_at(self.confidence)[1]

@@ -129,7 +129,7 @@ def find_calibration(event: str, study: Study) -> EventCalibration | None:
     """
     env_id = study.question.env_id
     newest = complete_id(find_scenario(env_id).name) == env_id.rpartition(":")[2]
-    return calibration(event, describe_traffic(study)) if newest else None  # type: ignore[arg-type]
+    return calibration(event, describe_traffic(study)) if newest else None
 
 
 def bound_shares(estimate: samplers.Estimate) -> list[float]:
