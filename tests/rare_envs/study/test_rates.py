@@ -468,7 +468,10 @@ def test_compare_without_a_scenario_sums_over_those_of_risk(cli: Any, tmp_path: 
     assert list(found["scenarios"]) == ["cut_in", "hard_brake"]
     assert found["scenarios"]["cut_in"]["shares"]["neither"] == 1.0
     assert "finished run" in cli(*words, "--out", tmp_path / "pair").stderr
-    report = cli("report", tmp_path / "pair")
-    assert report.exit_code == 2 and "sums several comparisons: expected the folder of one, " in report.stderr
+    assert list(found["outcomes"])[:2] == ["near_crashes", "serious_injuries"]
+    assert (tmp_path / "pair" / "hard_brake_near_crashes" / "comparison.json").exists()
+    assert cli("report", tmp_path / "pair").exit_code == 0
+    page = (tmp_path / "pair" / "report.html").read_text()
+    assert "+ near-crashes" in page and "cut-in: no failure was found" in page
     gated = cli(*words, "--max-ratio", 1)
     assert gated.exit_code == 5 and gated.stdout.splitlines()[-1].startswith("GATE undecided (exit code 5)")
