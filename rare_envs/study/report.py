@@ -465,9 +465,7 @@ class Report:
         return found
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
-        """Return JSON-ready values: question, estimate, the `top` most likely failures, and the answer as text."""
-        from rare_envs.study.text import WHOLE, describe_answer, list_gate  # which needs this module
-
+        """Return JSON-ready values: question, estimate, the `top` most likely failures; `report_as_json` adds text."""
         failures, space = self.estimate.failures, self.study.problem.space
         listed = itertools.islice(zip(failures, self.crashes, strict=True), top)
 
@@ -524,7 +522,6 @@ class Report:
                 for name, found in self.other_bases.items()
             ],
             "version": __version__,
-            "text": [*describe_answer(self, most=WHOLE), *list_gate(self.verdict)],
         }
 
     def _parameters(self, x: NDArray[np.float64]) -> dict[str, Any]:

@@ -138,7 +138,7 @@ class ScenarioRisk:
             "events": None if fitted is None else fitted.events.used[0],
             "site_factors": dict(self.site_factors),
             "kinds_per_million_km": self.kinds,
-            "report": self.report.to_dict(),
+            "report": text.report_as_json(self.report),
         }
 
 

@@ -428,6 +428,11 @@ def list_avoided(kinds: Mapping[str, tuple[float, float]], a: str, b: str) -> li
     return [("Avoided", say("avoided", a=a, b=b, share=share, kinds=", ".join(parts)))]
 
 
+def report_as_json(report: Report) -> dict[str, Any]:
+    """Return a report as values of JSON, with the whole answer as `text`."""
+    return {**report.to_dict(), "text": [*describe_answer(report, most=WHOLE), *list_gate(report.verdict)]}
+
+
 def name_p(question: Question) -> str:
     """Return what a question counts."""
     if not explain_other_events(question):

@@ -39,6 +39,7 @@ from rare_envs.study.question import (
     read_about,
 )
 from rare_envs.study.report import Report
+from rare_envs.study.text import report_as_json
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 from samplers.journal import Journal, JournalError, NothingRecorded
 from samplers.result import method_settings
@@ -254,7 +255,7 @@ def write_run(folder: Path, report: Report) -> None:
         'no_hits'
     """
     space, faults, kinds = report.study.problem.space, report.faults, report.kinds
-    replace_text(folder / run_folder.RESULT, format_json(report.to_dict()) + "\n")
+    replace_text(folder / run_folder.RESULT, format_json(report_as_json(report)) + "\n")
     nobody = ("" if kinds.unknown else CRASH_KINDS[NONE], *("" for _ in run_folder.CRASH[1:]))
     crashes = [
         (

@@ -276,11 +276,11 @@ def tell(found: Any, out: Path | None = None, details: bool = False) -> Answer:
     if isinstance(found, Answer):
         return found
     from rare_envs.study.report import Report
-    from rare_envs.study.text import list_gate, print_report
+    from rare_envs.study.text import list_gate, print_report, report_as_json
 
     if isinstance(found, Report):
         show, verdict = functools.partial(print_report, found, out, details), found.verdict
-        return Answer(found.to_dict(), show, _find_code(verdict, found.doubtful))
+        return Answer(report_as_json(found), show, _find_code(verdict, found.doubtful))
     if isinstance(found, tuple):
         compared, _, data = found
         limit, exact = (data["question"][name] for name in ("max_ratio", "assume_traffic"))
