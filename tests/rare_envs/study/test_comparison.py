@@ -19,22 +19,13 @@ from rare_envs.study.run_folder import read_failures
 from tests.rare_envs.study.conftest import write_base
 
 Array = NDArray[np.float64]
-BRAKING = 0.25
-"""Deceleration of B [m/s^2], 10 s long; A keeps its speed."""
-
-
-def keep_speed(observation: Array) -> Array:
-    return np.zeros((len(observation), 2))
-
-
-def brake(observation: Array) -> Array:
-    return np.tile([-BRAKING / 5.0, 0.0], (len(observation), 1))  # of 5 m/s^2
+BRAKING = 0.25  # deceleration of B [m/s^2], 10 s long; A keeps its speed
 
 
 def meet(base: Path, n: int) -> tuple[Array, Array]:
     """Return by pencil and paper whether A and B run into a lead that keeps its speed, and how fast, (2, n)."""
-    space = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=str(base)).space
-    speed, lead, gap = space.sample(n, np.random.default_rng(1)).T
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=str(base))
+    speed, lead, gap = problem.space.sample(n, np.random.default_rng(1)).T
     closing = np.stack([speed - lead] * 2)
     braking = np.array([[0.0], [BRAKING]])
     reach = 10.0 * closing - 50.0 * braking  # both still close in after 10 s, closing > 2.5 m/s
@@ -46,9 +37,8 @@ def test_severity_and_shares_are_those_of_pencil_and_paper(tmp_path: Path) -> No
     """Delta-v is half of the speed at contact, as both cars weigh the same; 4 standard errors of 3,000 draws."""
     base = write_base(tmp_path / "base.json", gap=115.0)
     hits, speed = meet(base, 400_000)
-    problems = [
-        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, base=str(base)) for ego in (keep_speed, brake)
-    ]
+    egos = [lambda seen, a=a: np.tile([-a / 5.0, 0.0], (len(seen), 1)) for a in (0.0, BRAKING)]  # of 5 m/s^2
+    problems = [rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, base=str(base)) for ego in egos]
     found = samplers.compare(*problems, "mc", seed=0, max_sim=6000)
     severity = weigh_crashes(found, problems)
     harder = severity.outcomes["delta_v_above_5"]
@@ -58,9 +48,7 @@ def test_severity_and_shares_are_those_of_pencil_and_paper(tmp_path: Path) -> No
             assert abs(pair.shares[name] - p) < 4.0 * math.sqrt(p * (1.0 - p) / 3000) + 2e-3, name  # ticks of 0.1 s
     injuries = severity.outcomes["serious_injuries"]
     assert injuries.parts["only_a"].p > 0 == injuries.parts["only_b"].p
-    (kind, (p, avoided)), *others = severity.kinds.items()
-    assert kind == "rear_end" and not others
-    assert p == pytest.approx(found.a.p) and avoided == pytest.approx(found.parts["only_a"].p)
+    assert severity.kinds == {"rear_end": pytest.approx((found.a.p, found.parts["only_a"].p))}
 
 
 def test_failures_of_a_comparison_have_f_of_both(here: Path, risky: str) -> None:
@@ -72,7 +60,6 @@ def test_failures_of_a_comparison_have_f_of_both(here: Path, risky: str) -> None
     assert np.minimum(table["f_A"], table["f_B"]) == pytest.approx(table["f"])
     assert (table["f_A"] <= 0).sum() == round(200 * pair.found.a.p) > (table["f_B"] <= 0).sum()
     assert pair.answer["kinds_of_a"]["rear_end"]["avoided_by_b"] > 0.5
-    assert any(line.startswith("Avoided      idm avoids ") for line in pair.answer["text"])
 
 
 def half_spaces(*at: float) -> list[samplers.FunctionProblem]:
@@ -111,7 +98,6 @@ def test_intervals_of_sums_of_scenarios_hold_ratios_and_shares() -> None:
             low, high = rate.interval_per_million_km
             held[key].append(low <= rates[key] <= high)
         held["ratio"].append(found.interval[0] <= rates["a"] / rates["b"] <= found.interval[1])
-        assert found.shares["neither"] == pytest.approx(1.0 - sum(list(found.shares.values())[:3]))
     assert {key: sum(each) for key, each in held.items() if sum(each) < stats.binom.ppf(1e-3, n, 0.93)} == {}
 
 
