@@ -16,7 +16,7 @@ from typer import Argument, Option
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder, refuse_existing
 from rare_envs.study.cli import options
 from rare_envs.study.cli.options import EGO_FILE, ForceOption, RunArgument, command
-from rare_envs.study.cli.shell import DOUBTFUL, NOISE, Answer
+from rare_envs.study.cli.shell import DOUBTFUL, NOISE, Answer, read_count
 from training.command_line import EventOptions, spread_options
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def train_ego_command(
     ] = None,
     algo: Annotated[str | None, Option(help="Algorithm of Stable-Baselines3.", show_default="ppo")] = None,
     steps: Annotated[
-        int, Option(help="Environment steps to train for.", parser=options.read_count, metavar="INTEGER")
+        int, Option(help="Environment steps to train for.", parser=read_count, metavar="INTEGER")
     ] = 200_000,
     out: Annotated[Path, Option(help="File to save the policy in.")] = Path("ego.zip"),
     num_envs: Annotated[int, Option(help="Number of parallel episodes.")] = 256,

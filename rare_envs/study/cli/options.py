@@ -13,8 +13,8 @@ from typer import Argument, Option
 from typer.core import TyperCommand
 
 from rare_envs.scenarios.registry import complete_id
-from rare_envs.study.arguments import KEYS, ExecutorOptions, Question, option_name, read_whole
-from rare_envs.study.cli.shell import FIELDS, Command, run_command
+from rare_envs.study.arguments import KEYS, ExecutorOptions, Question, option_name
+from rare_envs.study.cli.shell import FIELDS, Command, read_count, run_command
 
 PANELS = {
     "Ego and scenario": "ego base scenario sites drivers observation action",
@@ -56,14 +56,6 @@ RUN_IN_FILES = ("chunk", "core", "device", "ensemble_run", "executor", "address"
 EGO_FILE = ("algo", "stats")
 KINDS: dict[str, Any] = {"noise": Literal["on", "fixed", "off"], "executor": Literal["local", "ray"] | None}
 """Types of options of which the fields have another."""
-
-
-def read_count(text: str) -> int:
-    """Return the whole number that a text stands for, such as "10000" or "1e4"."""
-    try:
-        return read_whole(text)
-    except ValueError:
-        raise typer.BadParameter(f"expected a whole number, such as 10000 or 1e4, got {text!r}.") from None
 
 
 def split_words(texts: Iterable[str] | None) -> list[str]:

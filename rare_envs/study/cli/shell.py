@@ -23,7 +23,15 @@ from typer.core import TyperGroup
 
 from rare_envs.plugins import EgoGone, clean_text
 from rare_envs.startup import advise_install, find_missing_libraries, restore_signals, use_one_thread
-from rare_envs.study.arguments import GATE_CODES, KEYS, BadInput, ExecutorOptions, as_bad_input, read_question_file
+from rare_envs.study.arguments import (
+    GATE_CODES,
+    KEYS,
+    BadInput,
+    ExecutorOptions,
+    as_bad_input,
+    read_question_file,
+    read_whole,
+)
 
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
@@ -296,6 +304,14 @@ def tell(found: Any, out: Path | None = None, details: bool = False) -> Answer:
 def _find_code(verdict: Any, doubtful: Any) -> int:
     """Return the exit code of an answer with a verdict, or with none."""
     return GATE_CODES[verdict.decision] if verdict is not None else DOUBTFUL if doubtful else 0
+
+
+def read_count(text: str) -> int:
+    """Return the whole number that a text stands for, such as "10000" or "1e4"."""
+    try:
+        return read_whole(text)
+    except ValueError:
+        raise typer.BadParameter(f"expected a whole number, such as 10000 or 1e4, got {text!r}.") from None
 
 
 class Command(NamedTuple):
