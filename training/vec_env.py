@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,8 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from rare_envs.distributions.coordinates import FloatArray
-from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.distributions.product import ProductDistribution
+from rare_envs.distributions.stratified import StratifiedDistribution
 from rare_envs.simulation.observation import map_kinds
 
 Indices = int | Iterable[int] | None
@@ -66,26 +65,21 @@ def sb3_vec_env(
     batches = [rare_envs.make_batch(each, size, **make_kwargs) for each, size in zip(ids, sizes, strict=True)]
     for batch in batches if even_strata else ():
         own: Any = batch.unwrapped
-        own.space = _even_out(own.space)
+        own.space = replace(own.space, base=_even_out(own.space.base))
     env = BatchedVecEnv(*batches)
     if seed is not None:
         env.seed(seed)
     return ScaledRewards(env, reward_scale)
 
 
-def _even_out(space: ScenarioSpace) -> ScenarioSpace:
-    """Return the space of an environment that draws the strata of its base equally often, if there are any."""
-    strata = getattr(space.base, "strata", None) or ()
-    if len(strata) < 2:
-        return space
-
-    def sample(n: int, rng: np.random.Generator) -> FloatArray:
-        which, x = rng.integers(len(strata), size=n), np.empty((n, space.dim))
-        for number, stratum in enumerate(strata):
-            x[which == number] = stratum.base.sample(int((which == number).sum()), rng)
-        return x
-
-    return replace(space, base=cast(Distribution, SimpleNamespace(sample=sample)))  # an environment only draws
+def _even_out(base: Any) -> Any:
+    """Return a traffic model, or one that an environment draws the same from, with strata of equal shares."""
+    plain = getattr(base, "distribution", base)
+    if isinstance(plain, ProductDistribution):
+        return ProductDistribution(tuple(map(_even_out, plain.blocks)))
+    if not isinstance(plain, StratifiedDistribution):
+        return base
+    return replace(plain, strata=tuple(each._replace(share=1 / len(plain.strata)) for each in plain.strata))
 
 
 def sb3_agents_env(

@@ -61,14 +61,14 @@ class DrawsAhead:
         """Return the next n rows, shape (n, d); the generator may be ahead of them until `settle`."""
         if not self._in_a_row:
             return self._base.sample(n, rng)
-        if rng is not self._rng or self._given + n > len(self._rows):
-            if rng is self._rng:
-                self.settle()
-            self._rng, self._before, self._given = rng, rng.bit_generator.state, 0
-            self._rows = self._base.sample(max(n, ROWS_AHEAD), rng)
+        left = self._rows[self._given :] if rng is self._rng else self._rows[:0]
+        if len(left) < n:
+            self._rng, self._before, self._given = rng, rng.bit_generator.state, n - len(left)
+            self._rows = self._base.sample(max(self._given, ROWS_AHEAD), rng)
             self._after = pickle.dumps(rng.bit_generator.state)
+            return np.concatenate([left, self._rows[: self._given]]) if len(left) else self._rows[:n].copy()
         self._given += n
-        return self._rows[self._given - n : self._given].copy()
+        return left[:n].copy()
 
     def settle(self) -> None:
         """Put the generator where it is after the rows that were given, and forget the others.

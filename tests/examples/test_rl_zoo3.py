@@ -15,8 +15,8 @@ import rare_envs
 from training.ego_training import HYPERPARAMETERS
 
 FOLDER = Path(__file__).parents[2] / "examples" / "rl_zoo3"
-OF_THE_ZOO = ("n_envs", "n_timesteps", "policy", "policy_kwargs")
-"""Settings of the training, not of the algorithm, and the policy's, which the Zoo reads as Python."""
+OF_THE_ZOO = ("n_envs", "n_timesteps", "policy", "policy_kwargs", "normalize")
+"""Settings of the training, not of the algorithm, and those of others that the Zoo reads as Python."""
 OURS = 256
 """Environments of `train_ego`; the Zoo's are fewer, with as many transitions between updates."""
 
@@ -43,6 +43,7 @@ def test_settings_are_those_of_our_own_training(algo: str) -> None:
         same = {name: value for name, value in ours.settings.items() if name != per_step}
         assert {name: entry[name] for name in same} == same
         assert policy_of(entry) == {**ours.policy, "activation_fn": nn.ReLU}
+        assert ("normalize" in entry) == (ours.reward_scale != 1.0)
         if algo == "dqn":  # `train_ego` keeps every transition, and waits for ten of each environment
             assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * OURS
 

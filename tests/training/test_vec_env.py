@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -160,16 +159,13 @@ def test_rewards_are_scaled_and_recorded_as_they_are() -> None:
         assert mine["episode"]["r"] == other["episode"]["r"] > 0.0
 
 
-def test_strata_are_drawn_evenly_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two strata with shares 0.99 and 0.01 each is half of the draws: a binomial count, to 5 deviations."""
-    low, high = np.array([14.0, 14.0, 5.0]), np.array([16.0, 16.0, 50.0])
-    parts = [BetaDistribution(np.full(3, 2.0), np.full(3, 2.0), low, top) for top in (high, high - [0, 0, 40.0])]
-    strata = [SimpleNamespace(name=name, base=base) for name, base in zip(("far", "near"), parts, strict=True)]
-    monkeypatch.setattr(BetaDistribution, "strata", strata, raising=False)
-    space = sb3_vec_env(FOLLOWING, 1, base=parts[0], even_strata=True).get_attr("space")[0]
-    gaps = space.base.sample(4_000, np.random.default_rng(0))[:, 2]
-    far = (gaps > 10.0).mean() / (parts[0].sample(4_000, np.random.default_rng(1))[:, 2] > 10.0).mean()
-    assert far == pytest.approx(0.5, abs=5 * 0.5 / 4_000**0.5)
+@pytest.mark.parametrize("beside", [{}, {"observation": "camera", "camera": (36, 60), "weather": True}])
+def test_strata_are_drawn_evenly_where_asked_for(beside: dict[str, Any]) -> None:
+    """Cutters who look and who do not are half of the draws each: a binomial count, to 5 deviations."""
+    whole = sb3_vec_env("rare_envs/CutIn-v1", 1, even_strata=True, **beside).get_attr("space")[0].base
+    base = getattr(whole, "blocks", (whole,))[0]
+    looked = whole.sample(4_000, np.random.default_rng(0))[:, base.column] > base.limits[0]
+    assert looked.mean() == pytest.approx(0.5, abs=5 * 0.5 / 4_000**0.5)
 
 
 # --- several agents ---------------------------------------------------------------------------
