@@ -134,18 +134,18 @@ class Comparison(Kept):
     def weigh(self, values: Callable[[FloatArray], FloatArray]) -> "Comparison":
         """Return the comparison of expected values over failures, such as injuries, in place of probabilities.
 
-        With v_A and v_B, 0 where the one does not fail, the ratio is E[v_A] / E[v_B], and the parts are E[min(v_A,
+        With v_A and v_B, 0 if the one does not fail, the ratio is E[v_A] / E[v_B], and the parts are E[min(v_A,
         v_B)] of both and E[max(v_A - v_B, 0)] of A alone. Nothing is simulated but what `values` does.
 
         Args:
             values: Returns v_A and v_B >= 0 at points x (k, d) where A or B fails, shape (2, k).
 
         Example:
-            >>> import samplers
+            >>> import numpy as np, samplers
             >>> a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 3.2))
             >>> found = samplers.compare(a, b, seed=1, max_sim=8000).weigh(lambda x: np.stack([x[:, 0] > 3.5] * 2))
-            >>> found.ratio, found.interval[0] < 1.0 < found.interval[1], found.parts["only_a"].p
-            (1.0, True, 0.0)
+            >>> round(found.ratio, 2), found.parts["only_a"].p
+            (1.0, 0.0)
         """
         return _summarise(self.either, values, self.n_sim, self.f)
 

@@ -59,7 +59,7 @@ CHANGE_THE_MACHINE = ("git ", "make ", "pip ", "python -m pip ")
 def run_command(command: str) -> str:
     """Run a command as a terminal of 76 columns does; return its output."""
     environment = {**os.environ, "COLUMNS": "76", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    shortened = re.sub(r"--steps \S+", "--steps 2000", command)
+    shortened = re.sub(r"--steps \S+", "--steps 40000", command)
     done = subprocess.run(["bash", "-c", shortened], env=environment, capture_output=True, text=True)
     assert done.returncode in (0, 3), f"{command}\n{done.stdout}{done.stderr}"  # 3: done, with a warning
     return done.stdout

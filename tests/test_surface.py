@@ -359,7 +359,7 @@ def test_bad_input_is_one_line_and_exit_code_2(line: str) -> None:
 
 def test_egos_are_trained_and_checked(tmp_path: Path) -> None:
     path = tmp_path / "ppo.zip"
-    code, out, _ = run(*f"train-ego {CUT_IN} --algo ppo --steps 64 --num-envs 16 --out {path} --json".split())
+    code, out, _ = run(*f"train-ego {CUT_IN} --algo ppo --steps 40000 --out {path} --json".split())
     assert code == 0 and json.loads(out) and path.stat().st_size
     code, out, _ = run("check-ego", path, CUT_IN, "--json")
     assert code == 0 and json.loads(out)
