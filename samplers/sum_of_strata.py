@@ -39,8 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from samplers.method import Goal, Interrupted, Outcome, Part, Stepping, Steps, offer_of
-from samplers.plain_draws import PlainDraws
+from samplers.method import Goal, Interrupted, Outcome, Part, PlainDraws, Stepping, Steps, offer_of
 from samplers.problem import FloatArray, Inputs
 from samplers.replicate import (
     DISAGREEMENT_LEVEL,

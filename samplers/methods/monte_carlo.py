@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from samplers.method import PlainDraws
 from samplers.methods.base import Method
-from samplers.plain_draws import PlainDraws
 
 
 @dataclass(frozen=True, kw_only=True)

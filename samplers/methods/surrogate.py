@@ -19,11 +19,10 @@ from scipy.special import logsumexp, ndtri
 
 from samplers.bases import Gaussian
 from samplers.importance import Draws, count_final_draws, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps
+from samplers.method import Goal, Interrupted, KeptDraws, Outcome, PlainDraws, Steps
 from samplers.methods.base import Method, SimulationSteps, Simulator, marginalise_noise
 from samplers.methods.kriging import MANY_DIMS, Kriging, Prediction, fit_kriging
 from samplers.methods.two_stage.regions import count_lineages
-from samplers.plain_draws import KeptDraws, PlainDraws
 from samplers.problem import FloatArray, Inputs, StandardNormal, check_settings
 from samplers.proposals import Mixture, fit_proposal_mixture, fit_shrunk_gaussian
 from samplers.sample import (

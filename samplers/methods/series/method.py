@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.importance import Draws, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps, offer_of, request_terms
+from samplers.method import Goal, Interrupted, Outcome, PlainDraws, Steps, offer_of, request_terms
 from samplers.methods.base import Method, SearchRun, SimulationSteps
 from samplers.methods.series import ROUNDS, WALKS
 from samplers.methods.series.fitting import PursuedTerm, TermHistory, mix_terms, pursue_walked, refit_terms
 from samplers.methods.series.walks import TermSimulator, plan_walks, walk_downhill
 from samplers.methods.subset import spend_on_subset_simulation
-from samplers.plain_draws import PlainDraws
 from samplers.problem import FloatArray, Inputs, check_settings
 from samplers.proposals import IsotropicNormal, draw_components, draw_counts, log_ratios, mixture_log_ratio
 from samplers.sample import DrawWeights, Status, binomial_cov, clopper_pearson

@@ -9,7 +9,7 @@ import numpy as np
 
 from samplers.importance import Draws, weighted_interval
 from samplers.mcmc import RootedPoints
-from samplers.method import Goal, Interrupted, Outcome, Steps
+from samplers.method import Goal, Interrupted, KeptDraws, Outcome, Steps
 from samplers.methods.base import (
     ComponentDraws,
     Method,
@@ -39,7 +39,6 @@ from samplers.methods.two_stage.stratified import (
     check_rounds,
     describe_discovery,
 )
-from samplers.plain_draws import KeptDraws
 from samplers.problem import Inputs, check_settings
 from samplers.sample import Interval, Status, add_unseen, binomial_cov, effective_sample_size
 

@@ -6,8 +6,7 @@ import numpy as np
 
 import samplers
 from samplers import plain_draws as kept_draws
-from samplers.method import Goal
-from samplers.plain_draws import KeptDraws
+from samplers.method import Goal, KeptDraws
 
 
 def test_draws_from_the_base_itself():
