@@ -72,7 +72,7 @@ def open_pickle(content: bytes, trust: bool = False) -> Any:
     """Return the object in a pickle; raise `ForbiddenObject` where it needs anything unlisted, but for trust."""
     if trust:
         return _RenamingUnpickler(io.BytesIO(content)).load()
-    return _Maker().make(_InertUnpickler(io.BytesIO(content)).load())
+    return make(read_notes(content))
 
 
 _RENAMED = {"gym.spaces": "gymnasium.spaces", "numpy.core": "numpy._core"}
@@ -107,12 +107,13 @@ MAX_STEPS = 100_000
 """Instructions of a pickle, each of which may make an object; that of a policy has some thousand."""
 
 
-class _Note:
+class Note:
     """What a pickle names; an instance is what it wants made of that: from arguments, a state, and entries put in."""
 
     name: ClassVar[str]
 
-    def __new__(cls, *arguments: Any) -> _Note:
+    def __new__(cls, *arguments: Any) -> Note:
+        """Return a note of what a class or function is to make of arguments."""
         note = super().__new__(cls)
         note.arguments, note.state, note.entries = arguments, None, dict[Any, Any]()
         return note
@@ -121,8 +122,10 @@ class _Note:
     state: Any
     entries: dict[Any, Any]
 
-    def __call__(self, *_: Any) -> None:
-        raise ForbiddenObject(f"it asks for {self.name}, which may run code")
+    def __call__(self, *arguments: Any) -> Note:
+        """Return a note of what it wants called, which is on no list."""
+        called: type[Note] = type("Note", (Note,), {"name": f"{self.name}()"})
+        return called(*arguments)
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
@@ -170,9 +173,14 @@ class _InertUnpickler(_PythonUnpickler):  # type: ignore[misc]
     }
     steps = 0
 
-    def find_class(self, module: str, name: str) -> type[_Note]:
+    def find_class(self, module: str, name: str) -> type[Note]:
         """Return a kind of note for a name."""
-        return type("Note", (_Note,), {"name": f"{module}.{name}"})
+        return type("Note", (Note,), {"name": f"{module}.{name}"})
+
+
+def read_notes(content: bytes) -> Any:
+    """Return what a pickle holds, with a `Note` in place of each object that is to be made."""
+    return _InertUnpickler(io.BytesIO(content)).load()
 
 
 # --- making -----------------------------------------------------------------------------------------
@@ -196,15 +204,21 @@ _NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 """Names of the dtypes of numbers."""
 
 
+def make(notes: Any) -> Any:
+    """Return what notes want; raise `ForbiddenObject` where that is anything unlisted."""
+    return _Maker().make(notes)
+
+
 class _Maker:
     """Makes what notes want, each once."""
 
     def __init__(self) -> None:
         self.made = dict[int, Any]()
-        self.special: dict[str, Callable[[_Note], Any]] = {
+        self.special: dict[str, Callable[[Note], Any]] = {
             "numpy.dtype": self.make_dtype,
             "numpy._core.numeric._frombuffer": lambda note: self.fill(*note.arguments),
-            "numpy._core.multiarray._reconstruct": self.make_array,
+            "numpy._core.multiarray._reconstruct": lambda note: self.make_array(note.state),
+            "jax._src.array._reconstruct_array": lambda note: self.make_array(note.arguments[2]),
             "numpy._core.multiarray.scalar": lambda note: self.fill(note.arguments[1], note.arguments[0], ())[()],
             "collections.OrderedDict": self.make_ordered,
         }
@@ -220,16 +234,16 @@ class _Maker:
             return {key: self.make(one) for key, one in value.items()}
         if type(value) in (list, tuple):
             return type(value)(map(self.make, value))
-        if isinstance(value, type) and issubclass(value, _Note):
+        if isinstance(value, type) and issubclass(value, Note):
             return _find_class(value.name, REFERRED_BASES)
-        if not isinstance(value, _Note):
+        if not isinstance(value, Note):
             return value
         name = _rename(value.name)
         if name.startswith(_GENERATORS):
             return None
         return self.special[name](value) if name in self.special else self.make_object(value)
 
-    def make_object(self, note: _Note) -> Any:
+    def make_object(self, note: Note) -> Any:
         """Return an object that was made empty and filled."""
         cls, state = _find_class(_rename(note.name), MADE_BASES), self.make(note.state)
         require(not note.arguments, f"it calls {note.name}, which may run code")
@@ -239,23 +253,23 @@ class _Maker:
         getattr(value, "__setstate__", value.__dict__.update)(state)  # in Python, and keeps what it is given
         return value
 
-    def make_ordered(self, note: _Note) -> OrderedDict[Any, Any]:
+    def make_ordered(self, note: Note) -> OrderedDict[Any, Any]:
         """Return a mapping of pairs."""
         pairs = [*(note.arguments[0] if note.arguments else ()), *note.entries.items()]
         require(all(_is_key(key) for key, _ in pairs), "it has keys that are no text or numbers")
         return OrderedDict((key, self.make(value)) for key, value in pairs)
 
-    def make_dtype(self, note: _Note) -> np.dtype[Any]:
+    def make_dtype(self, note: Note) -> np.dtype[Any]:
         """Return a dtype of numbers."""
         name, *_ = note.arguments
         require(isinstance(name, str) and _NUMBERS.fullmatch(name), f"it holds an array of {name!r:.50}, not numbers")
         dtype: np.dtype[Any] = np.dtype(name)
         return dtype.newbyteorder(note.state[1]) if type(note.state) is tuple else dtype
 
-    def make_array(self, note: _Note) -> NDArray[Any]:
+    def make_array(self, state: Any) -> NDArray[Any]:
         """Return an array that is filled by its state."""
-        require(type(note.state) is tuple and len(note.state) == 5, "it holds an array that is not filled")
-        _, shape, dtype, fortran, content = note.state
+        require(type(state) is tuple and len(state) == 5, "it holds an array that is not filled")
+        _, shape, dtype, fortran, content = state
         return self.fill(content, dtype, shape, "F" if fortran is True else "C")
 
     def fill(self, content: Any, kind: Any, shape: Any, order: Any = "C") -> NDArray[Any]:

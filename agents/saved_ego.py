@@ -45,6 +45,9 @@ _STEP = 0.5
 _FASTEST = 0.6
 """Speed of an ego in Kinematics, 48 m/s of 80: HighwayEnv's stay below, and cosines of headings are above."""
 CONFIG_ADVICE = "test it in HighwayEnv's own environment with the config of its training (env_config)"
+SBX_ADVICE = (
+    "name module:function, whose function returns sbx.PPO.load(FILE), or of the algorithm that it is (docs/egos.md)"
+)
 OUTLYING = 5.0
 """Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
 
@@ -166,9 +169,12 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str
     name = find_algorithm(header, algo, str(path))
     try:
         policy, policy_kwargs = build_policy(name, header, weights, trust)
-    except ForbiddenObject as error:
-        raise ValueError(f"Will not load {str(path)!r}: {error}; {TRUST}.") from error
     except Exception as error:  # a damaged or foreign file can raise anything at all
+        if weights is None:
+            why = str(error) if isinstance(error, ForbiddenObject) else one_line(error)
+            raise ValueError(f"Cannot load {str(path)!r}, a model of sbx: {why}; {SBX_ADVICE}.") from error
+        if isinstance(error, ForbiddenObject):
+            raise ValueError(f"Will not load {str(path)!r}: {error}; {TRUST}.") from error
         contrib = "pip install sb3-contrib" if "sb3_contrib" in str(error) else "needs a package that is not installed"
         raise ValueError(
             f"Cannot load {str(path)!r} as {name.upper()} (saved by Stable-Baselines3 {header['version']}): "

@@ -265,7 +265,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("mine.txt", "")
     refuse(tmp_path / "other.zip", "not a Stable-Baselines3 model")
-    refuse(change_settings(path, policy_class={"__module__": "sbx.ppo.policies"}), "a model of sbx.* name module:func")
+    with zipfile.ZipFile(tmp_path / "jax.zip", "w") as archive:
+        archive.writestr("data", '{"policy": 1, "policy_class": {"__module__": "sbx.crossq.policies"}}')
+    refuse(tmp_path / "jax.zip", "a model of sbx: networks of CROSSQ are not known; name module:func")
     (tmp_path / "folder.zip").mkdir()
     refuse(tmp_path / "folder.zip", "got the folder")
 
