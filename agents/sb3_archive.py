@@ -227,6 +227,8 @@ def _name_function(value: Any) -> str:
     """Return the name of a function of JAX that a note refers to or holds; another's with its module."""
     if isinstance(value, type) and issubclass(value, Note):
         module, _, name = value.name.rpartition(".")
+    elif not isinstance(value.state, dict):  # in the file itself
+        return "of its own"
     elif "__name__" in value.state:  # of a derivative of its own
         module, name = value.state["__module__"], value.state["__name__"]
     else:  # compiled
