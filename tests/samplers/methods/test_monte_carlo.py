@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import samplers
-from samplers import plain_draws as kept_draws
+from samplers import method as kept_draws
 from samplers.method import Goal, KeptDraws
 
 
