@@ -70,7 +70,7 @@ class RoomToBrake(NamedTuple):
     Example:
         >>> room = RoomToBrake("lead_gap", "cut_in_gap", "ego_speed", "lead_speed", least=-4.0, braking=8.0)
         >>> start = {"cut_in_gap": -8.0, "ego_speed": 20.0, "lead_speed": 12.0}  # a cutter of 5 m beside the ego
-        >>> room.range_in(start.get)[0]  # to its lead, which is 1 + 4 m ahead of the ego
+        >>> float(room.range_in(start.get)[0])  # to its lead, which is 1 + 4 m ahead of the ego
         8.0
     """
 
