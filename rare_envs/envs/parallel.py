@@ -20,6 +20,7 @@ from rare_envs.envs.rendering import RENDER_MODES, Renderer
 from rare_envs.envs.rows_and_infos import (
     Info,
     SingleObservation,
+    draw_scenarios,
     episode_info,
     mask_infos,
     merge_rows,
@@ -166,7 +167,7 @@ class DrivingParallelEnv(_SeveralAgents, ParallelEnv[str, SingleObservation, Flo
             self.np_random, _ = seeding.np_random(seed)
         if options == {"options": 1}:
             options = None  # what PettingZoo's conformance test asks for, to see that options are taken at all
-        self._x = self.space.scenario_x(options, 1, self.np_random)[0]
+        self._x = draw_scenarios(self.world, self.space, options, 1, self.np_random)[0]
         self._tick, self._memory, self.agents = 0, None, list(self.possible_agents)
         self._episode = episode = self._start(self._x[None])
         views = self._views(episode)
@@ -309,7 +310,7 @@ class AgentsVectorEnv(_SeveralAgents, VectorEnv[NDArray[np.float32], NDArray[Any
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start all scenarios, by one generator: observations (B A, F), and infos."""
         super().reset(seed=seed)
-        self._x = self.space.scenario_x(options, self.scenarios, self.np_random)
+        self._x = draw_scenarios(self.world, self.space, options, self.scenarios, self.np_random)
         self._tick[:] = 0
         self._episode = self._start(self._x)
         return self._observe(self._episode), {}

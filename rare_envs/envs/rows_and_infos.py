@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,6 +24,7 @@ from rare_envs.multi_agent import view_order
 from rare_envs.simulation.decision import EgoReward, StepResult, advance, find_reward, name_terms, reward_terms
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import map_kinds
+from rare_envs.traffic.bodies import overlaps, pairs
 from rare_envs.traffic.crash import describe_crash
 from rare_envs.traffic.state import map_leaves
 
@@ -36,6 +37,26 @@ ROWS_AHEAD = 256
 """Scenarios that are drawn at once: a few cost as much as these."""
 DRAWS_IN_A_ROW = (TruncatedGaussianMixture, BetaDistribution, StratifiedDistribution)
 """Distributions whose draws of m rows and then of n are those of m + n rows."""
+
+
+def draw_scenarios(
+    world: World,
+    space: ScenarioSpace,
+    options: Mapping[str, Any] | None,
+    n: int,
+    rng: np.random.Generator,
+    draw: Callable[[int, np.random.Generator], FloatArray] | None = None,
+) -> FloatArray:
+    """Return scenarios as by `ScenarioSpace.scenario_x`; refuse options with which vehicles begin in each other."""
+    x = space.scenario_x(options, n, rng, draw)
+    if options:
+        own = torch.from_numpy(x).float()[:, : next(iter(world.columns.values()))]
+        touch = overlaps(world.scenario.initial(own), world.scenario.road, "all").nonzero().tolist()
+        if touch:
+            one, other = (world.scenario.labels[of[touch[0][1]]] for of in pairs(world.scenario.vehicles))
+            row = f" (row {touch[0][0]})" if n > 1 else ""
+            raise ValueError(f"Expected vehicles apart at the start, got {other} in {one}{row}; change gaps or places.")
+    return x
 
 
 class DrawsAhead:

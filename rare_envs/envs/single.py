@@ -17,6 +17,7 @@ from rare_envs.envs.rendering import RENDER_MODES, Renderer, make_scene
 from rare_envs.envs.rows_and_infos import (
     SingleObservation,
     StatesLength,
+    draw_scenarios,
     episode_info,
     open_reward,
     step_info,
@@ -119,7 +120,7 @@ class DrivingEnv(StatesLength, gym.Env[SingleObservation, Any]):
             Observation and info.
         """
         super().reset(seed=seed)
-        self._x = self.space.scenario_x(options, 1, self.np_random)[0]
+        self._x = draw_scenarios(self.world, self.space, options, 1, self.np_random)[0]
         self._tick = 0
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())

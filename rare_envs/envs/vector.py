@@ -22,6 +22,7 @@ from rare_envs.envs.rows_and_infos import (
     DrawsAhead,
     Info,
     StatesLength,
+    draw_scenarios,
     list_tensors,
     mask_infos,
     merge_rows,
@@ -273,7 +274,9 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
             common = iter(self._ahead.sample(own.count(None), rng) if None in own else ())
             return np.stack([next(common) if each is None else self.space.base.sample(1, each)[0] for each in own])
 
-        return self.space.scenario_x(options, len(rows), rng, draw if self._own else self._ahead.sample)
+        return draw_scenarios(
+            self.world, self.space, options, len(rows), rng, draw if self._own else self._ahead.sample
+        )
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None

@@ -223,11 +223,11 @@ class Risk:
         level, whole = f"{100 * total.confidence:g} %: ", sum(kinds.values())
         per_km = text.format_events(total, "", level)
         beside = "" if counted is None else f"; people {text.describe_people(counted, total.confidence)}"
-        parts = (f"{text.format_share(r / whole)} {text.describe_kind(kind)}" for kind, r in kinds.items() if whole)
+        shares = {kind: rate / whole for kind, rate in kinds.items()} if whole else {}
         rows = {
             "Limited by": text.describe_uncertainty(total),
             "Calibration": text.describe_calibrations(self.events),
-            "Crashes": ", ".join(parts),
+            "Crashes": text.describe_kinds(shares),
             "Injuries": "" if self.injuries is None else text.describe_injuries(self.injuries),
         }
         facts = [*(row for row in rows.items() if row[1]), *list_warnings(self.warnings), *last]

@@ -77,8 +77,20 @@ def format_ratio(ratio: float | None, interval: Sequence[float | None]) -> str:
 
 
 def format_share(share: float) -> str:
-    """Return a share in per cent: whole, or one digit below 1 %."""
+    """Return a share in per cent: whole, or one digit below 1 %; 100 % is all of it."""
+    if 0.995 <= share < 1 - 1e-9:
+        return "over 99 %"
     return f"{100 * share:.0f} %" if share >= 0.01 else f"{100 * share:.1g} %"
+
+
+def format_shares(shares: Sequence[float]) -> list[str]:
+    """Return shares of one whole in per cent that add to no more than 100: the largest is at most what remains."""
+    texts = [format_share(share) for share in shares]
+    largest = int(np.argmax(shares)) if texts else 0
+    others = sum(float(each.removesuffix(" %")) for k, each in enumerate(texts) if k != largest)
+    if others >= 1:
+        texts[largest] = f"{min(round(100 * shares[largest]), math.floor(100 - others))} %"
+    return texts
 
 
 def name_scenario(name: str) -> str:
@@ -151,7 +163,10 @@ def describe_parts(shares: Mapping[str, float], unresolved: Mapping[str, float])
     "of which unseen 92 %, looked 8 %", or "of which unseen 100 %; stratum looked: too few failures found, below 2.6".
     """
     ordered = sorted(shares.items(), key=lambda part: -part[1])
-    known = ", ".join(f"{name} {format_share(share)}" for name, share in ordered if name not in unresolved)
+    texts = format_shares([share for _, share in ordered])
+    known = ", ".join(
+        f"{name} {text}" for (name, _), text in zip(ordered, texts, strict=True) if name not in unresolved
+    )
     vague = (say("too few failures", name=name, high=format_rate(high)) for name, high in unresolved.items())
     return "".join([*([f"of which {known}"] if known else []), *vague]).removeprefix("; ")
 
@@ -204,7 +219,8 @@ def describe_uncertainty(total: exposure.TotalRate) -> str:
         high = format_rate(rate.interval_per_million_km[1])
         parts.append(say(fact, name=name_scenario(rate.scenario), high=high))
     if total.shares:
-        sources = ", ".join(f"{format_share(each.share)} {name_source(each)}" for each in total.shares)
+        texts = format_shares([each.share for each in total.shares])
+        sources = ", ".join(f"{text} {name_source(each)}" for text, each in zip(texts, total.shares, strict=True))
         parts.append(f"{'the rest: ' if parts else ''}{sources}")
     return "; ".join(parts)
 
@@ -424,7 +440,8 @@ def list_avoided(kinds: Mapping[str, tuple[float, float]], a: str, b: str) -> li
     named = {kind: each for kind, each in kinds.items() if each[0] > NAMED_SHARE * whole}
     parts = [f"{format_share(less / own)} of {describe_kind(kind)}" for kind, (own, less) in named.items()]
     if len(named) > 1:
-        parts = [f"{part} ({format_share(own / whole)})" for part, (own, _) in zip(parts, named.values(), strict=True)]
+        texts = format_shares([own / whole for own, _ in named.values()])
+        parts = [f"{part} ({text})" for part, text in zip(parts, texts, strict=True)]
     return [("Avoided", say("avoided", a=a, b=b, share=share, kinds=", ".join(parts)))]
 
 
@@ -518,7 +535,7 @@ def _describe_crashes(report: Report) -> str:
     if not len(failures):
         return "no failure found"
     named = {kind: each.of_failures for kind, each in shares.items() if each.of_failures >= NAMED_SHARE}
-    kinds = ", ".join(f"{format_share(share)} {describe_kind(kind)}" for kind, share in named.items())
+    kinds = describe_kinds(named)
     k = _find_likeliest(failures)
     what, unusual = _describe_end(report, k), _list_unusual(space, failures.x[k])
     text = f"{what}, {unusual or say('usual')}"
@@ -526,6 +543,12 @@ def _describe_crashes(report: Report) -> str:
     if other is not None and other.n >= ENOUGH and report.study.question.ego != MODEL:
         kinds += f"; {say('avoids', driver=OTHER_NOUNS[MODEL], share=format_share(1 - other.fails))}"
     return say("likeliest", kinds=kinds, what=text) if kinds else text
+
+
+def describe_kinds(shares: Mapping[str, float]) -> str:
+    """Return kinds of crash with their shares."""
+    texts = format_shares([*shares.values()])
+    return ", ".join(f"{text} {describe_kind(kind)}" for text, kind in zip(texts, shares, strict=True))
 
 
 def _find_likeliest(failures: samplers.Failures) -> int:

@@ -8,6 +8,7 @@ import pytest
 
 import rare_envs
 from rare_envs.distributions import BetaDistribution
+from rare_envs.envs.parallel import AgentsVectorEnv
 from rare_envs.envs.rows_and_infos import DRAWS_IN_A_ROW, ROWS_AHEAD, DrawsAhead
 from rare_envs.envs.vector import DrivingVectorEnv
 from rare_envs.scenarios.registry import SCENARIOS
@@ -157,6 +158,22 @@ def test_a_wrong_mask_or_mode_is_refused(mask: np.ndarray) -> None:
         batch.reset(options={"reset_mask": mask})
     with pytest.raises(ValueError, match=r"autoreset_mode 'later'; expected one of 'NextStep', 'SameStep', 'Disabled'"):
         rare_envs.make_batch("rare_envs/CutIn-v0", 2, autoreset_mode="later")
+
+
+def test_vehicles_that_begin_in_each_other_are_refused() -> None:
+    """A cutter of 5 m whose rear is 10 m behind the ego's front has a lead whose rear is lead_gap - 5 m before it."""
+    apart, touching = ({"cut_in_gap": -10.0, "lead_gap": gap} for gap in (5.1, 4.9))
+    batches = (
+        AgentsVectorEnv("rare_envs/CutIn-v1", 2),
+        rare_envs.make_batch("rare_envs/CutIn-v1", 2),
+    )
+    for env in (gym.make("rare_envs/CutIn-v1"), rare_envs.parallel_env("rare_envs/CutIn-v1"), *batches):
+        env.reset(seed=0, options=apart)
+        with pytest.raises(ValueError, match="vehicles apart at the start, got the lead in the ego"):
+            env.reset(seed=0, options=touching)
+    for env in batches:
+        with pytest.raises(ValueError, match=r"the lead in the ego \(row 1\)"):
+            env.reset(seed=0, options={"cut_in_gap": -10.0, "lead_gap": np.array([5.1, 4.9])})
 
 
 BETA = BetaDistribution([2.0, 0.5], [2.0, 3.0], [0.0, 1.0], [1.0, 4.0])
