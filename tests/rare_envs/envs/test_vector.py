@@ -163,10 +163,7 @@ def test_a_wrong_mask_or_mode_is_refused(mask: np.ndarray) -> None:
 def test_vehicles_that_begin_in_each_other_are_refused() -> None:
     """A cutter of 5 m whose rear is 10 m behind the ego's front has a lead whose rear is lead_gap - 5 m before it."""
     apart, touching = ({"cut_in_gap": -10.0, "lead_gap": gap} for gap in (5.1, 4.9))
-    batches = (
-        AgentsVectorEnv("rare_envs/CutIn-v1", 2),
-        rare_envs.make_batch("rare_envs/CutIn-v1", 2),
-    )
+    batches = AgentsVectorEnv("rare_envs/CutIn-v1", 2), rare_envs.make_batch("rare_envs/CutIn-v1", 2)
     for env in (gym.make("rare_envs/CutIn-v1"), rare_envs.parallel_env("rare_envs/CutIn-v1"), *batches):
         env.reset(seed=0, options=apart)
         with pytest.raises(ValueError, match="vehicles apart at the start, got the lead in the ego"):
@@ -226,10 +223,7 @@ def test_terms_have_the_names_of_highway_env_and_others_are_refused() -> None:
     assert info["reward_terms"] == pytest.approx({"collision": 0.0, "right_lane": 0.0, "high_speed": 0.2}, abs=1e-3)
     assert earned == pytest.approx(0.2, abs=1e-3)
     for wrong, said in (
-        (
-            {"speeed": 1.0},
-            r"^Unknown term of the reward 'speeed' \(did you mean 'speed'\?\); expected one of '",
-        ),
+        ({"speeed": 1.0}, r"^Unknown term of the reward 'speeed' \(did you mean 'speed'\?\); expected one of '"),
         ({"speed": None}, "^Expected a finite number as the weight of 'speed' in the reward, got None"),
         (3, "^Expected reward as weights by term, a function or 'module:function', got 3"),
         (lambda step: step.sped, "AttributeError: .* 'sped'"),

@@ -119,13 +119,7 @@ def test_states_in_double_precision_are_left_to_torch():
     assert env._episode.state.x.dtype == torch.float64
 
 
-@pytest.mark.parametrize(
-    ("env_id", "arguments"),
-    [
-        ("Highway-v0", {}),
-        ("CutIn-v0", {"observation": "lidar"}),
-    ],
-)
+@pytest.mark.parametrize(("env_id", "arguments"), [("Highway-v0", {}), ("CutIn-v0", {"observation": "lidar"})])
 def test_other_worlds_are_stepped_by_torch(env_id, arguments):
     env = gym.make(f"rare_envs/{env_id}", **arguments).unwrapped
     assert find_scripted_step(env.world) is None and env._compiled is None

@@ -6,14 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.scenarios.registry import (
-    SCENARIOS,
-    Registry,
-    complete_id,
-    env_id_of,
-    find_scenario,
-    split_layout,
-)
+from rare_envs.scenarios.registry import SCENARIOS, Registry, complete_id, env_id_of, find_scenario, split_layout
 from tests.rare_envs.scenarios.standing import STANDING
 
 PLACE = "place_of_this_registry_test"

@@ -10,14 +10,7 @@ import torch
 
 import rare_envs
 from rare_envs.traffic.bodies import overlaps
-from rare_envs.traffic.crash import (
-    CRASH_KINDS,
-    contact_speed,
-    crash_of,
-    crash_of_others,
-    describe_crash,
-    injury_risk,
-)
+from rare_envs.traffic.crash import CRASH_KINDS, contact_speed, crash_of, crash_of_others, describe_crash, injury_risk
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.measures.moments import COASTING

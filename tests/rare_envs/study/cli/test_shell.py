@@ -15,12 +15,7 @@ import typer
 from typer.testing import CliRunner
 
 from rare_envs.study.arguments import BadInput
-from rare_envs.study.cli.shell import (
-    Answer,
-    OneLineErrors,
-    keep_stdout_for_the_answer,
-    signals_as_exceptions,
-)
+from rare_envs.study.cli.shell import Answer, OneLineErrors, keep_stdout_for_the_answer, signals_as_exceptions
 from tests.rare_envs.study.refusals import SMALL, Cli
 
 
