@@ -182,6 +182,10 @@ class Repeatability(NamedTuple):
     n_elsewhere: int | None = 0
     """Answers of an ego `module:function` that are others in another process; None if it gave none there."""
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON; no number of a difference that is infinite, as to a scenario without f."""
+        return {**self._asdict(), "largest": self.largest if math.isfinite(self.largest) else None}
+
     @property
     def warning(self) -> str:
         """Doubt about p; "" if none differ."""
@@ -510,7 +514,7 @@ class Report:
             ],
             "n_faults": len(self.faults),
             "n_retried": self.n_retried,
-            "repeatability": None if self.repeatability is None else self.repeatability._asdict(),
+            "repeatability": None if self.repeatability is None else self.repeatability.to_dict(),
             "faults": [{"parameters": self._parameters(one.x), "reason": one.reason} for one in self.faults[:top]],
             "units": dict(zip(space.names, space.units, strict=True)),
             "rate": convert(self.rate),

@@ -18,6 +18,7 @@ from scipy.special import ndtri
 import samplers
 from rare_envs import exposure, people
 from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.egos.reference import REFERENCE_EGOS
 from rare_envs.measures import MEASURES
 from rare_envs.people import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.plugins import clean_text
@@ -270,6 +271,26 @@ def _explain_calibration(events: Sequence[Mapping[str, Any]]) -> list[str]:
         ]
     near = f"within a factor {people.CALIBRATED_WITHIN:g} of people's interval"
     return [f"In these events the crash rate of the human driver model is {near}."] if events else []
+
+
+def explain_reference(result: Result) -> list[str]:
+    """Return a sentence for each reference driver that crashes more often than people in the events of a run.
+
+    That is known from the ego's failures alone: its rate times the share in which the other crashes too.
+    """
+    events, ego = result.get("events") or [], result["question"]["ego"]
+    if not events or any(each["people"] is None for each in events):
+        return []
+    rate, counted = (sum(each["per_million_km"] for each in found) for found in (events, [e["people"] for e in events]))
+    most = sum(each["people"]["interval_per_million_km"][1] for each in events)
+    nouns = " and ".join(EVENT_NOUNS.get(each["event"], each["event"]) for each in events)
+    fails = {name: each["fails"] for name, each in (result.get("other_drivers") or {}).items()} | {ego: 1.0}
+    return [
+        f"{name} crashes at least {format_rate(rate * share / counted)} times as often as people in {nouns}: what it "
+        "avoids of them says little of careful people."
+        for name, share in fails.items()
+        if name in REFERENCE_EGOS and rate * share > most
+    ]
 
 
 def explain_risk(risk: Result) -> list[str]:

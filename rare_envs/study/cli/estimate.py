@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -16,6 +17,7 @@ from rare_envs.study.arguments import BadInput, Question, as_bad_input, find_met
 from rare_envs.study.cli import options
 from rare_envs.study.cli.options import command
 from rare_envs.study.cli.shell import DOUBTFUL, EXECUTOR, Answer, tell
+from rare_envs.study.run_folder import RESULT
 
 if TYPE_CHECKING:
     from samplers import Estimate
@@ -281,7 +283,7 @@ def risk_command(
     more=("env_id", *options.WORLD_IN_FILES, *options.RUN_IN_FILES),
     texts=("algo_b", "stats_b"),
     stopped=NOTHING_MADE,
-    max_sim={"help": "Largest number of simulations, of both egos together.", "show_default": "12,000"},
+    max_sim={"help": "Largest number in each scenario, of both egos together.", "show_default": "12,000"},
 )
 def compare_command(
     ego_a: Annotated[str, Argument(metavar="EGO_A", help="Policy A, the one before, as for estimate --ego.")],
@@ -302,12 +304,12 @@ def compare_command(
         )
     how: dict[str, Any] = {"out": out, "progress": True, "force": force, "executor": executor}
     how |= {"algo_b": algo_b, "stats_b": stats_b}
+    asked["max_sim"] = asked["max_sim"] or PAIR_SIMULATIONS
     if env is not None:
         from rare_envs.study.comparison import compare_egos
 
-        asked["max_sim"] = asked["max_sim"] or PAIR_SIMULATIONS
         return tell(compare_egos(_ask(env, {**asked, "ego": ego_a}), ego_b, **how), out, details)
-    from rare_envs.study.comparison import compare_risks
+    from rare_envs.study.compared_risks import compare_risks
     from rare_envs.study.risk import SCENARIO_SET
 
     base = asked.pop("base")
@@ -329,14 +331,17 @@ def resume_command(
     details: options.DetailsOption = False,
 ) -> Answer:
     """Continue an interrupted estimate, risk or compare; the result is the same as without the interruption."""
-    from rare_envs.study import comparison, evaluate, writing
+    from rare_envs.study import compared_risks, comparison, evaluate, writing
 
     trust = asked["trust"]
     folder, whole, questions = writing.find_whole(run, mend)
     if whole and (ego or on_error):
+        begun = (folder / name for name in questions)
+        part = shlex.quote(str(next((each for each in begun if not (each / RESULT).exists()), folder)))
+        first = f"resume the scenario that has them first (rare-envs resume {part}), then this without them"
         raise BadInput(
-            f"--ego and --on-error are for a run of rare-envs estimate, and {str(run)!r} is of {whole['command']}: "
-            "resume it without them, or begin again with --force."
+            f"--ego and --on-error are for a run of one scenario, and {str(run)!r} is of {whole['command']}: "
+            f"{first if whole['command'] == 'risk' else 'resume it without them'}, or begin again with --force."
         )
     if not whole:
         return tell(evaluate.resume(run, ego, on_error, trust, progress=True, executor=executor), run, details)
@@ -350,6 +355,6 @@ def resume_command(
         return tell(comparison.resume_comparison(folder, questions, trust, executor), folder, details)
     from rare_envs.study.risk import resume_risk
 
-    resume = comparison.resume_compared_risks if whole["command"] == writing.SUM else resume_risk
+    resume = compared_risks.resume_compared_risks if whole["command"] == writing.SUM else resume_risk
     with as_bad_input(ValueError):
         return tell(resume(folder, questions, whole, trust=trust, executor=executor), folder, details)

@@ -312,6 +312,7 @@ def _describe_run(
             "quoted_folder": shlex.quote(str(folder)),
             "answer": unfold_rows(result["text"][1:]),
             "meaning": text.explain_run(result, study.about),
+            "reference": text.explain_reference(result),
             "doubts": [*([edited + ", ".join(changed)] if changed else []), *own],
             "remarks": [each for each in noted if each not in own],
             "end": describe_outcome(str(result.get("status")), own),

@@ -25,7 +25,7 @@ from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.simulation.observation import observation_space
 from rare_envs.study import BadInput, Question, prepare, run
-from rare_envs.study.comparison import RiskComparison
+from rare_envs.study.compared_risks import RiskComparison
 from rare_envs.study.report import describe_left_out, find_frequency, fold_spread, list_part_errors
 from rare_envs.study.risk import compare_sites
 from rare_envs.study.text import (
