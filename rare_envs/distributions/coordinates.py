@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -87,6 +89,20 @@ class RoomToBrake(NamedTuple):
         return self.least - column(self.beside) + closing * closing / (2.0 * self.braking), np.inf
 
 
+def _read_cut(cut: Any) -> Difference | RoomToBrake:
+    """Return a cut from its names of columns and two numbers, as files hold it."""
+    names, ends = (list(cut[:-2]), list(cut[-2:])) if isinstance(cut, list | tuple) else ([], [])
+    kind: Any = {2: Difference, 4: RoomToBrake}.get(len(names))
+    numbers = all(isinstance(end, Real) and not isinstance(end, bool) and not math.isnan(end) for end in ends)
+    if kind is None or not (numbers and all(isinstance(name, str) for name in names)):
+        wanted = " or ".join(f"({', '.join(each._fields)})" for each in (Difference, RoomToBrake))
+        raise ValueError(f"Expected each cut of within as {wanted}, names and numbers, got {cut!r}.")
+    if kind is RoomToBrake and ends[1] <= 0.0:
+        raise ValueError(f"Expected braking > 0 in within, got {ends[1]!r}.")
+    found: Difference | RoomToBrake = kind(*cut)
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Coordinates:
     """Coordinates y of points x in a box: one for each column of x, computed in an order of their own.
@@ -139,8 +155,9 @@ class Coordinates:
         self._check_columns()
         for j, kind in enumerate(self.kinds):
             self._check_kind(self.names[j] if self.names else f"column {j}", j, kind)
-        cuts = tuple(Difference(*each) if len(each) == 4 else RoomToBrake(*each) for each in self.within)
-        object.__setattr__(self, "within", cuts)
+        if not isinstance(self.within, list | tuple):
+            raise ValueError(f"Expected within as a list of cuts, got {self.within!r}.")
+        object.__setattr__(self, "within", tuple(map(_read_cut, self.within)))
         self._check_within()
 
     @property
