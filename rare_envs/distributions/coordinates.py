@@ -93,7 +93,7 @@ def _read_cut(cut: Any) -> Difference | RoomToBrake:
     """Return a cut from its names of columns and two numbers, as files hold it."""
     names, ends = (list(cut[:-2]), list(cut[-2:])) if isinstance(cut, list | tuple) else ([], [])
     kind: Any = {2: Difference, 4: RoomToBrake}.get(len(names))
-    numbers = all(isinstance(end, Real) and not isinstance(end, bool) and not math.isnan(end) for end in ends)
+    numbers = not any(isinstance(end, bool) or not isinstance(end, Real) or math.isnan(end) for end in ends)
     if kind is None or not (numbers and all(isinstance(name, str) for name in names)):
         wanted = " or ".join(f"({', '.join(each._fields)})" for each in (Difference, RoomToBrake))
         raise ValueError(f"Expected each cut of within as {wanted}, names and numbers, got {cut!r}.")
