@@ -1,9 +1,9 @@
 """How fast is it beside EnvPool's HighwayEnv, which is C++? The same two cars, side by side in turn, on one core.
 
-    python -m benchmarks.simulation.envpool_pair
+    python -m benchmarks.simulation.throughput --only-envpool --out benchmarks/results/envpool.json
 
-`make bench` runs it where EnvPool is installed. Both move two vehicles by ticks of 0.1 s for 20 s, 1,024 episodes at
-once, and show a policy HighwayEnv's `kinematics` (5, 5). EnvPool's ego acts by meta-actions only.
+`make bench` measures it too, where EnvPool is installed. Both move two vehicles by ticks of 0.1 s for 20 s, 1,024
+episodes at once, and show a policy HighwayEnv's `kinematics` (5, 5). EnvPool's ego acts by meta-actions only.
 """
 
 from collections.abc import Callable
@@ -73,7 +73,16 @@ def _measure_pair(
 
     pair = {"ours": drive(ours, actions), "theirs": drive(theirs, choices)}
     pair["ours"]()  # compiles
-    return {name: [choices.size / seconds(run) for _ in range(rounds)] for name, run in pair.items()}
+    return _time_in_turn({name: (choices.size, run) for name, run in pair.items()}, rounds)
+
+
+def _time_in_turn(works: dict[str, tuple[int, Callable[[], object]]], rounds: int) -> dict[str, list[float]]:
+    """Return how much of each work, (amount, function), is done per second, one after the other in each round."""
+    rates = {name: list[float]() for name in works}
+    for _ in range(rounds):
+        for name, (amount, work) in works.items():
+            rates[name].append(amount / seconds(work))
+    return rates
 
 
 def measure_policy(decisions_per_second: int, rounds: int) -> dict[str, list[float]]:
@@ -102,10 +111,8 @@ def measure_policy(decisions_per_second: int, rounds: int) -> dict[str, list[flo
             seen, *_ = theirs.step(layers[2](hidden).argmax(dim=1).numpy().astype(np.int32))
 
     with torch.inference_mode():
-        return {
-            "ours": [HORIZON * len(x) / seconds(lambda: problem.evaluate(x)) for _ in range(rounds)],
-            "theirs": [HORIZON * EPISODES / seconds(drive) for _ in range(rounds)],
-        }
+        ours = (HORIZON * len(x), lambda: problem.evaluate(x))
+        return _time_in_turn({"ours": ours, "theirs": (HORIZON * EPISODES, drive)}, rounds)
 
 
 @use_one_thread()
@@ -117,14 +124,3 @@ def measure_all(rounds: int = 5) -> dict[str, dict[str, list[float]]]:
         "envpool_policy_decision": measure_policy(1, rounds),
         "envpool_policy_tick": measure_policy(TICKS_PER_SECOND, rounds),
     }
-
-
-def main() -> None:
-    """Print all."""
-    for name, rates in measure_all().items():
-        own, other = (float(np.median(rates[side])) for side in ("ours", "theirs"))
-        print(f"{name:28s} {own / other:8.3g} times EnvPool ({own:,.0f} beside {other:,.0f} per second)")
-
-
-if __name__ == "__main__":
-    main()
