@@ -143,10 +143,39 @@ def names_function(spec: str) -> bool:
     return names_object(spec) and spec.partition(":")[0] not in RULE_BASED_EGOS
 
 
+def _is_function(spec: str) -> bool:
+    """Return whether a name is a function, whatever file its settings name, and not a file of such a name."""
+    return names_function(spec) and not isfile(spec) and ("?" in spec or not spec.endswith(EGO_SUFFIXES))
+
+
+_WRAPPERS = {"noisy:": {each.name for each in fields(Stack)}, "process:": {"timeout", "patience"}}
+"""What stands around another ego, and its settings."""
+
+
+def split_wrapper(spec: str) -> tuple[str, str]:
+    """Return the ego inside "noisy:EGO?settings" or "process:EGO?settings", and the settings of what is around it.
+
+    They stand behind the last "?" and are the inner ego's if one is none of the wrapper's and the ego takes such.
+    """
+    wrapper, _, inner = spec.partition(":")
+    ego, _, query = inner.rpartition("?")
+    names = {each.partition("=")[0] for each in query.split("&")}
+    own = names <= _WRAPPERS[f"{wrapper}:"] or not _takes_settings(ego, names)
+    return (ego, query) if "?" in inner and own and not isfile(inner) else (inner, "")
+
+
+def _takes_settings(ego: str, names: set[str]) -> bool:
+    """Return whether settings may be those of an ego, which has none yet or stands inside others."""
+    if rule_based := RULE_BASED_EGOS.get(ego):
+        return any(hasattr(getattr(rule_based, "model", rule_based), name) for name in names)
+    shipped = ego in (*SHIPPED_DRIVERS, *SHIPPED_EGOS)
+    return ego.startswith((*_WRAPPERS,)) or ("?" not in ego and (shipped or "://" in ego or _is_function(ego)))
+
+
 def strip_prefixes(spec: str) -> str:
     """Return the ego inside `noisy:` and `process:`, without their settings."""
-    while spec.startswith(("noisy:", "process:")):
-        spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
+    while spec.startswith((*_WRAPPERS,)):
+        spec, _ = split_wrapper(spec)
     return spec
 
 
@@ -181,9 +210,9 @@ def _load_rule_based(text: str, *_: Any) -> Any:
 
 def _load_noisy(text: str, *how: Any) -> NoisyEgo:
     """Return any ego behind the imperfections of a full stack."""
-    inner, mark, settings = _require_inner_ego(text).rpartition("?")
-    stack = Stack(**_read_settings(Stack, settings if mark else ""))
-    return NoisyEgo(load_ego(inner if mark else settings, *how), stack)
+    inner, settings = _require_inner_ego(text)
+    stack = Stack(**_read_settings(Stack, settings))
+    return NoisyEgo(load_ego(inner, *how), stack)
 
 
 def _load_elsewhere(text: str, *how: Any) -> Any:
@@ -193,7 +222,7 @@ def _load_elsewhere(text: str, *how: Any) -> Any:
     except ImportError as error:
         raise ValueError(f"{text!r} needs pyzmq and msgpack: {advise_install('remote')}.") from error
     try:
-        return isolate(_require_inner_ego(text), *how) if text.startswith("process:") else connect(text)
+        return isolate(*_require_inner_ego(text), *how) if text.startswith("process:") else connect(text)
     except EgoGone as error:
         raise ValueError(str(error)) from error
 
@@ -227,6 +256,7 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
     "noisy": (lambda spec: spec.startswith("noisy:"), _load_noisy),
     "hub": (lambda spec: spec.startswith(HUB_PREFIX), lambda text, *how: load_saved_ego(find_hub_model(text), *how)),
     "remote": (lambda spec: spec.startswith(("tcp://", "ipc://")), _load_elsewhere),
+    "function": (_is_function, _make_ego),
     "url": (lambda spec: "://" in spec, _refuse_url),
     "rule": (lambda spec: spec.partition("?")[0] in RULE_BASED_EGOS, _load_rule_based),
     "vision": (
@@ -243,17 +273,16 @@ KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
         lambda spec: spec.endswith(".zip") or isfile(spec),  # of too long a name too
         lambda text, *how: load_saved_ego(Path(text), *how),
     ),
-    "function": (names_function, _make_ego),
 }
 """Kinds of ego, the first that holds of a name counts: whether it does, and how the ego is loaded."""
 
 
-def _require_inner_ego(text: str) -> str:
-    """Return the ego behind "noisy:" or "process:", with settings."""
+def _require_inner_ego(text: str) -> tuple[str, str]:
+    """Return the ego behind "noisy:" or "process:", and the settings of these."""
     kind, _, inner = text.partition(":")
     if not inner.partition("?")[0]:
         raise ValueError(f"Expected an ego behind {kind + ':'!r}, such as {kind}:model.zip, got {text!r}.")
-    return inner
+    return split_wrapper(text)
 
 
 _SETTINGS: dict[type, tuple[str, Callable[[float], bool]]] = {

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
+from os.path import isfile
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from rare_envs.control.actions import ACTIONS
 from rare_envs.distributions.fitted import join_independent
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.needs import EgoNeeds
-from rare_envs.egos.policy import find_policies
+from rare_envs.egos.policy import find_policies, split_drivers
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import check_name, did_you_mean, make_object, names_object
 from rare_envs.scenarios.base import Scenario, load_base
@@ -99,7 +100,7 @@ def set_up(
     check_name("action", action, ACTIONS)
     if not isinstance(weather, bool):
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
-    if isinstance(drivers, str) and "=" not in drivers and names_object(drivers):
+    if isinstance(drivers, str) and names_object(drivers) and not (isfile(drivers) or split_drivers(drivers)):
         drivers = make_object(drivers, "drivers")
     policies = find_policies(drivers, scenario, trust)
     background = find_drivers(scenario.drivers if drivers is None or policies else drivers)

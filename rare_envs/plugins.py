@@ -65,8 +65,12 @@ def names_object(spec: str) -> bool:
 
 def split_settings(spec: str) -> tuple[str, dict[str, str]]:
     """Return the name and the settings in "module:name?file=policy.pt&layers=2", texts as they stand."""
-    name, _, query = spec.partition("?")
-    return name, {key: value for key, _, value in (each.partition("=") for each in query.split("&") if each)}
+    (name, _, query), settings = spec.partition("?"), dict[str, str]()
+    for key, _, value in (each.partition("=") for each in query.split("&") if each):
+        if not key or not value or key in settings:
+            raise ValueError(f"Expected settings as name=value, each name once, got {key!r} {value!r} in {spec!r}.")
+        settings[key] = value
+    return name, settings
 
 
 def make_object(spec: str, kind: str, call: bool = True) -> Any:

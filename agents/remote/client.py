@@ -421,7 +421,9 @@ def connect(spec: str) -> RemoteEgo:
     return RemoteEgo(ServerLink(address, protocol.read_secret()), **settings)
 
 
-def isolate(spec: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None) -> RemoteEgo:
-    """Load an ego in a process of its own, as `agents.load_ego` does; "?timeout=10" behind its name bounds answers."""
-    name, settings = parse_address(spec)
-    return RemoteEgo(ProcessLink(name, algo=algo, trust=trust, stats=stats), **settings)
+def isolate(
+    spec: str, times: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None
+) -> RemoteEgo:
+    """Load an ego in a process of its own, as `agents.load_ego` does; `times`, such as "timeout=10", bound answers."""
+    _, settings = parse_address(f"process?{times}" if times else "process")
+    return RemoteEgo(ProcessLink(spec, algo=algo, trust=trust, stats=stats), **settings)

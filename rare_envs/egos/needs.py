@@ -75,7 +75,11 @@ class FunctionEgo:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
         """Stable-Baselines3's `predict`; the function has no memory."""
-        return np.asarray(read_output(self.function(observation))), state
+        actions = read_output(self.function(observation))
+        try:
+            return np.asarray(actions), state
+        except ValueError:  # parts of several shapes
+            raise ValueError(_ONE_OUTPUT.format(got=f"{len(actions)} outputs")) from None
 
 
 @dataclass(frozen=True)
@@ -104,22 +108,30 @@ class ModuleEgo:
         return actions
 
 
+_ONE_OUTPUT = (
+    "Expected a network that gives actions, or a tuple of tensors, actions and values (B, 1), got {got}; put a module "
+    "around it that gives actions alone (the mean of PPO, tanh of SAC's), or an object with predict if it has a memory."
+)
+
+
 def read_output(output: Any) -> Any:
     """Return the actions in what a network gives: of five scores the best, of a distribution the mode, not the values.
 
     Values are what stands, (B, 1), behind the actions in a pair; other pairs could be mean and deviation, whose mean
     some algorithms squash: a ValueError says so.
     """
-    if isinstance(output, tuple) and any(isinstance(part, torch.Tensor | Distribution) for part in output):
-        output, *others = output
-        if len(others) != 1 or getattr(others[0], "ndim", 0) != 2 or others[0].shape[1] != 1:
-            raise ValueError(
-                f"Expected a network that gives actions, or actions and values (B, 1), got {1 + len(others)} outputs; "
-                "put a module around it that gives actions alone (the mean of PPO, tanh of SAC's), or an object with "
-                "predict if it has a memory."
-            )
+    parts = output if isinstance(output, tuple | list) else ()
+    pair = isinstance(output, tuple) and any(isinstance(part, torch.Tensor | Distribution) for part in parts)
+    if pair or any(isinstance(part, Distribution) or getattr(part, "ndim", 0) > 1 for part in parts):
+        output, *others = parts
+        if not pair or len(others) != 1 or getattr(others[0], "ndim", 0) != 2 or others[0].shape[1] != 1:
+            raise ValueError(_ONE_OUTPUT.format(got=f"{len(parts)} outputs"))
     if isinstance(output, Distribution):
-        output = output.mode
+        try:
+            output = output.mode
+        except NotImplementedError:  # as of a squashed one
+            got = f"a {type(output).__name__} whose mode is not known"
+            raise ValueError(_ONE_OUTPUT.format(got=got)) from None
     output = output.detach() if isinstance(output, torch.Tensor) else output
     if getattr(output, "ndim", 0) != 2:
         return output

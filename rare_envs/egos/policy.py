@@ -261,7 +261,7 @@ def find_policies(drivers: Any, scenario: Scenario, trust: bool = False) -> tupl
             continuous actions.
     """
     _, *names = scenario.vehicle_names
-    given: Any = drivers
+    given: Any = (drivers := wrap_callable(drivers))
     if isinstance(drivers, str | Path):
         named = [] if isfile(drivers) else split_drivers(str(drivers))  # a path may have a "=" too
         given = dict(named) if named else drivers

@@ -128,7 +128,7 @@ def check_ego(question: Question, time_limit: float = 30.0) -> list[Finding]:
         return [Finding("origin", "fail", f"{name!r} is a remote place", advice)]
     if kind == "unknown":
         raise BadInput(f"Unknown ego {name!r}{suggest_ego(name)}; expected {EXPECTED_EGO}.")
-    if name.endswith(EGO_SUFFIXES) and not path.exists():
+    if kind != "function" and name.endswith(EGO_SUFFIXES) and not path.exists():
         raise BadInput(report_missing_file(path))
     if kind == "zip":
         reasons = "; ".join(find_origin_risks(path, find_statistics(path)))

@@ -266,9 +266,10 @@ def find_named_files(name: str) -> list[Path]:
     spec, settings = split_settings(name) if names_function(name) else (name, {})
     parts = spec.split(":")
     with contextlib.suppress(OSError, ValueError):  # too long a name, or with a null byte
-        files, given = (
-            [path for path in map(Path, names) if path.is_file()] for names in ((name, *parts), settings.values())
-        )
+        files = [path for path in map(Path, (name, *parts)) if path.is_file()]
+        named = map(Path, filter(os.path.exists, settings.values()))  # folders too
+        found = itertools.chain.from_iterable((path, *path.rglob("*")) for path in named)
+        given = [path for path in found if path.is_file()]
         modules = (find_module_file(part) for part in parts[:-1] if part.replace(".", "_").isidentifier())
         return [*(files or [path for path in modules if path is not None]), *given]
     return []

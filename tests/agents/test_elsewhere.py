@@ -15,14 +15,15 @@ from stable_baselines3 import DQN
 from torch import nn
 
 from agents import load_ego
-from rare_envs.study.arguments import BadInput, Question
-from rare_envs.study.evaluate import resume
-from rare_envs.study.writing import begin_journal
+from agents.loading import strip_prefixes
+from rare_envs import DrivingProblem
+from rare_envs.study.arguments import Question
+from rare_envs.study.question import digest_files
 
 ADAPTER = """
 import torch
 from safetensors.torch import load_file
-from torch.distributions import Normal
+from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
 class Net(torch.nn.Module):
     def __init__(self, file, head="mean"):
@@ -34,7 +35,9 @@ class Net(torch.nn.Module):
     def forward(self, seen):
         out = self.decoder(seen)
         pairs = {"values": (out, out[:, :1]), "normal": (Normal(out, 1.0), out[:, :1]), "deviation": (out, out)}
-        return {"mean": out, **pairs, "memory": (out, (out, out))}[self.head]
+        squashed = TransformedDistribution(Normal(out, 1.0), [TanhTransform()])
+        pairs |= {"memory": (out, (out, out)), "list": [out, out[:, :1]], "squashed": squashed}
+        return {"mean": out, **pairs, "arrays": (out.detach().numpy(), out[:, :1].detach().numpy())}[self.head]
 """
 
 
@@ -53,7 +56,7 @@ def write_weights(file: str, outputs: int = 2) -> nn.Module:
 
 
 @pytest.mark.parametrize("file", ["ppo.cleanrl_model", "any.safetensors"])
-@pytest.mark.parametrize("head", ["mean", "values", "normal", "deviation", "memory"])
+@pytest.mark.parametrize("head", ["mean", "values", "normal", "deviation", "memory", "list", "arrays", "squashed"])
 @pytest.mark.parametrize("outputs", [2, 5])
 def test_weights_alone_drive_through_a_function(file: str, head: str, outputs: int, seen: Any) -> None:
     layer = write_weights(file, outputs)
@@ -61,8 +64,8 @@ def test_weights_alone_drive_through_a_function(file: str, head: str, outputs: i
     with pytest.raises(ValueError, match=rf"^[^\n]*'{file}'[^\n]*module:function\?file={file} \(docs/egos\.md"):
         load_ego(file)
     ego: Any = load_ego(f"adapter_for_test:Net?file={file}&head={head}")
-    if head in ("deviation", "memory"):  # a mean may be squashed or not, a memory must be kept
-        with pytest.raises(ValueError, match=r"actions and values \(B, 1\), got 2 outputs; put a module around .*tanh"):
+    if head in ("deviation", "memory", "list", "arrays", "squashed"):  # a mean may be squashed or not, say
+        with pytest.raises(ValueError, match=r"^.* \(B, 1\), got (2|a Trans).* module around .*tanh.*$"):
             ego.predict(seen)
     elif outputs == 5:  # scores of discrete actions, of which the best counts
         assert ego.predict(seen)[0].tolist() == expected.argmax(1).tolist()
@@ -70,25 +73,28 @@ def test_weights_alone_drive_through_a_function(file: str, head: str, outputs: i
         np.testing.assert_allclose(ego.predict(seen)[0], expected, atol=1e-5)
 
 
-def test_a_run_rests_on_the_file_of_its_function_too(seen: Any) -> None:
-    Path("run").mkdir()
-    write_weights("a.pt")
-    question = Question(env_id="rare_envs/CarFollowing-v0", ego="noisy:adapter_for_test:Net?file=a.pt?latency=0.1")
-    begin_journal(Path("run"), question).close()
-    write_weights("a.pt")
-    with pytest.raises(BadInput, match=r"^a\.pt has changed since the run"):
-        resume(Path("run"), trust=True)
+@pytest.mark.parametrize("file", ["a.pt", "a.zip", "a.onnx", "a.safetensors", "there/a.pt"])
+@pytest.mark.parametrize("how", ["{}", "noisy:{}", "noisy:{}?lag=1", "process:{}", "noisy:process:{}?timeout=9?lag=1"])
+def test_a_function_takes_whatever_file_its_settings_name(file: str, how: str, seen: Any) -> None:
+    Path("there").mkdir()
+    write_weights(file)
+    named = f"adapter_for_test:Net?file={file if file[1] == '.' else 'there'}"
+    question = Question(env_id="", ego=how.format(named))
+    assert strip_prefixes(question.ego) == named
+    assert [*map(Path, digest_files(question))] == [Path("adapter_for_test.py").resolve(), Path(file)]
+    if file == "a.zip" or (file[1] == "." and "process" not in how):
+        DrivingProblem("rare_envs/CutIn-v0", ego=load_ego(question.ego), drivers=named)
 
 
 FEATURES = ["presence", "x", "y", "cos_h", "sin_h"]
 
 
 @pytest.mark.parametrize("setting", [{}, {"absolute": True}, {"normalize": False}, {"features": FEATURES}])
-def test_other_kinematics_are_told_by_the_last_observations(setting: dict[str, Any], tmp_path: Path) -> None:
+def test_other_kinematics_are_told_by_the_last_observations(setting: dict[str, Any], seen: Any) -> None:
     env = gym.make("highway-fast-v0", config={"observation": {"type": "Kinematics", **setting}})
     model = DQN("MlpPolicy", env, buffer_size=10, device="cpu")
     model._last_obs = env.reset(seed=0)[0][None]  # which training leaves there
-    model.save(tmp_path / "ego.zip")
+    model.save("ego:a?b=c.zip")  # no function
     here = gym.make("rare_envs/CutIn-kinematics-v0").observation_space
-    doubt = load_ego(tmp_path / "ego.zip").find_normalisation_doubt(here)  # type: ignore[union-attr]
+    doubt = load_ego("ego:a?b=c.zip").find_normalisation_doubt(here)  # type: ignore[union-attr]
     assert all(f"({key}); test it in HighwayEnv's" in doubt for key in setting) and bool(doubt) == bool(setting)

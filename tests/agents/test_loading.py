@@ -66,6 +66,8 @@ UNKNOWN = {
     "noisy:idm?latency=soon": "Expected latency to be a finite number >= 0, got 'soon'",
     "noisy:idm?missed=1": "missed below 1",
     "noisy:idm?lag=-1": "Expected lag to be a finite number >= 0",
+    "a:b?file=a&file=b": "^Expected settings as name=value, each name once, got 'file' 'b'",
+    "noisy:a:b?file=": "^Expected settings .* got 'file' ''",
     "noisy:idn": "Unknown ego 'idn'",
 }
 """Names and settings that cannot be used, and what is said."""
