@@ -288,6 +288,7 @@ FACTS: Mapping[str, str] = MappingProxyType(
         "ratio not known": "not known: no failure of {a} or {b} found",
         "undecided which": ": undecided which one {fails} more often",
         "avoided": "{b} avoids {share} of the crashes of {a}: {kinds}",
+        "near below": "found + near-crashes below crashes, which they include: more simulations help",
         "above people": "{name} crashes {times} times as often as people in these events",
         "side": "{p}{odds}; {low} to {high}{exact}",
         "side without a failure": "no failure found; below {high}{exact}",

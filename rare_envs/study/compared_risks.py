@@ -29,15 +29,15 @@ from rare_envs.startup import __version__
 from rare_envs.study import text, writing
 from rare_envs.study.arguments import Question, as_bad_input, output_folder
 from rare_envs.study.comparison import DELTA_V, INJURIES, ComparedEgos, compare_egos, list_kinds, list_numbers
-from rare_envs.study.question import CHANGEABLE, open_question, prepare
+from rare_envs.study.question import CHANGEABLE, note_question, open_question, prepare
 from rare_envs.study.report import MODEL_NOUN, find_frequency, fold_spread
-from rare_envs.study.risk import SCENARIO_SET, choose_scenarios
+from rare_envs.study.risk import SCENARIO_SET, choose_scenarios, list_asked
 from rare_envs.study.run_folder import COMPARISON, FAILURES, JOURNAL, SIDES
 from samplers.analysis.gate import find_doubt, judge_ends
 from samplers.comparison import RATIO_COARSE, Comparison, Side, format_sides, list_ratio_rows
 from samplers.evaluate import Executor
 from samplers.output import LABEL, MOST_LINES, WIDTH, Row, fold_rows, say
-from samplers.problem import FloatArray
+from samplers.problem import FloatArray, check_whole
 from samplers.result import list_warnings
 
 LEAST = 1e-300
@@ -394,7 +394,7 @@ def compare_risks(
 
     Example:
         >>> from rare_envs.study.compared_risks import compare_risks
-        >>> found = compare_risks("idm", "rss", scenarios=["car_following"], method="mc", max_sim=200, seed=0)
+        >>> found = compare_risks("idm", "rss", scenarios=["hard_brake"], method="mc", max_sim=200, seed=0)
         >>> found.per_million_km["a"], found.ratio
         (0.0, nan)
     """
@@ -417,19 +417,26 @@ def resume_compared_risks(
 ) -> RiskComparison:
     """Continue an interrupted comparison of risks, as `resume_risk`."""
     trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
-    for question in questions.values():
-        open_question(asdict(question), folder, trust)
-    options = {**whole["options"], "trust": trust, "device": first.device}  # the cores of A and B may differ
     with as_bad_input(KeyError, TypeError, AttributeError):
+        for question in _list_asked(whole):
+            open_question(asdict(question), folder, trust)
+        options = {**whole["options"], "trust": trust, "device": first.device}  # the cores of A and B may differ
         return _compare_sums(dict(whole), folder, True, False, executor, options)
+
+
+def _list_asked(whole: Mapping[str, Any]) -> list[Question]:
+    b = {"ego": whole["ego_b"], "algo": whole["b"]["algo_b"], "stats": whole["b"]["stats_b"]}
+    return list_asked(whole, {"ego": whole["ego_a"]}, b)
 
 
 def _ask_near(question: Question) -> tuple[Question, Question]:
     """Return the question of crashes and that of near-crashes, which share the simulations."""
     n = question.max_sim
+    if n is not None:
+        check_whole("max_sim (of A and B, crashes and near-crashes)", n, 4)
     near = None if n is None else max(2, round(NEAR_SHARE * n))
     more = replace(question, measure="near_crash", gamma=0.0, max_ratio=None, core="auto", max_sim=near)
-    return replace(question, max_sim=None if n is None or near is None else max(2, n - near)), more
+    return replace(question, max_sim=None if n is None or near is None else n - near), more
 
 
 def _compare_sums(
@@ -451,6 +458,8 @@ def _compare_sums(
             )
             frequencies[name] = find_frequency(prepare(asked[name]))
     if folder is not None:
+        for each in [] if options.get("trust") else _list_asked(whole):  # what needed trust needs it again
+            note_question(each)
         parts = {folder / name / side: each for name, each in asked.items() for side in SIDES}
         if force:
             clear_folders = (folder, *(folder / name for name in asked))

@@ -28,7 +28,7 @@ from rare_envs.study import text
 from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.plots import save_risk_plot
-from rare_envs.study.question import CHANGEABLE, Study, build_problem, open_question, prepare
+from rare_envs.study.question import CHANGEABLE, Study, build_problem, note_question, open_question, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL, RISK
 from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
@@ -332,11 +332,21 @@ def resume_risk(folder: Path, questions: Mapping[str, Question], whole: Mapping[
     The answer is that of an undisturbed one; `how` has trust and an executor.
     """
     trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
-    for question in questions.values():
-        open_question(asdict(question), folder, trust)
-    options = {**whole["options"], "trust": trust, "core": first.core, "device": first.device}
     with as_bad_input(KeyError, TypeError, AttributeError):
+        for question in list_asked(whole, {"ego": whole["ego"]}):
+            open_question(asdict(question), folder, trust)
+        options = {**whole["options"], "trust": trust, "core": first.core, "device": first.device}
         return _risk(whole["ego"], dict(whole), whole["bases"], folder, True, False, executor, options)
+
+
+def list_asked(whole: Mapping[str, Any], *egos: Mapping[str, Any]) -> list[Question]:
+    """Return questions with all that the arguments of a command over scenarios name; nothing of it is loaded.
+
+    There is one for each ego, with its fields of a question, in each environment and base, in any spelling.
+    """
+    names, bases = [*whole["scenarios"], *whole["bases"]], whole["bases"]
+    worlds = [{**whole["options"], "env_id": name, "base": bases.get(name)} for name in names]
+    return [Question(**{**world, **ego}) for world in worlds for ego in egos]
 
 
 def _risk(
@@ -358,7 +368,7 @@ def _risk(
     with as_bad_input(TypeError, ValueError):
         if options.get("max_p") is not None:
             raise ValueError("Expected max_rate, a limit of the sum, not max_p.")
-        asked = {"ego": ego_name, **options}
+        asked = {**options, "ego": ego_name}
         questions = {name: Question(env_id=env_id, base=base, **asked) for name, (env_id, base) in chosen.items()}
     left_out = _find_misfits(questions, None if named else ego)
     with as_bad_input(ValueError):
@@ -369,6 +379,9 @@ def _risk(
         studies = [prepare(question, None if named else ego) for question in fitting.values()]
         for study in studies:
             find_frequency(study)
+    if folder is not None and not options.get("trust"):  # what needed trust needs it again
+        for question in list_asked(whole, {"ego": whole["ego"]}):
+            note_question(question)
     with contextlib.nullcontext() if folder is None else output_folder(folder, RISK, PICTURE, folders=fitting):
         if folder is not None and force:
             (folder / RISK).unlink(missing_ok=True)
