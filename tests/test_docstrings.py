@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from rare_envs.startup import use_one_thread
+from rare_envs.study.compared_risks import compare_risks
 
 PACKAGES = ("samplers", "rare_envs", "agents", "training")
 MODULES = [f"samplers.{name}" for name in ("comparison", "distributions", "executors", "problem", "run", "strata")]
@@ -45,7 +46,7 @@ def public_objects() -> dict[str, object]:
     return dict(found.values())
 
 
-PUBLIC = public_objects()
+PUBLIC = public_objects() | {"rare_envs.study.compared_risks.compare_risks": compare_risks}
 WITHOUT_EXAMPLE = {
     "rare_envs.measures.stl": "needs rtamt, which runs on Python 3.11 or older; docs/measures.md has an example",
     "rare_envs.study.cli.main": "a program, which reads sys.argv and exits",

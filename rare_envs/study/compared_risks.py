@@ -319,6 +319,9 @@ class RiskComparison(RateComparison):
             if ego in REFERENCE_EGOS and counted is not None and above > 1:
                 times = text.format_rate(rate.per_million_km / counted.per_million_km)
                 rows.append(("Careful", say("above people", name=name, times=times)))
+        near = self.outcomes.get(NEAR_CRASHES, self).per_million_km
+        if any(near[key] < self.per_million_km[key] for key in ("a", "b", "both")):  # the two have runs of their own
+            rows.append(("Careful", say("near below")))
         return rows
 
     def details(self) -> str:

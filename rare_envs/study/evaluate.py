@@ -47,10 +47,11 @@ from rare_envs.study.question import (
     list_risks,
     note_question,
     open_question,
+    open_run,
     prepare,
 )
 from rare_envs.study.report import Repeatability, Report, find_frequency
-from rare_envs.study.run_folder import RESULT_FILES, STUDY
+from rare_envs.study.run_folder import RESULT_FILES, STUDY, LoadedStudy
 from samplers.estimation import add_ensemble_run, check_base, run_method
 from samplers.evaluate import Evaluator, Executor, Simulated, find_changed
 from samplers.journal import Journal
@@ -437,12 +438,15 @@ def _keeping(folder: Path, study: Study, journal: Journal, part: bool = False) -
         raise RunInterrupted(f"{known}{kept(known.report)}", known.report) from None
 
 
-def plan_from_result(recorded: Mapping[str, Any], target_cov: float) -> tuple[samplers.analysis.PlannedRun, ...]:
-    """Return what the method of a run, of which result.json holds this, and plain Monte Carlo need."""
-    described, asked = recorded.get("method"), recorded.get("question")
+def plan_from_result(
+    study: LoadedStudy, target_cov: float, trust: bool = False
+) -> tuple[samplers.analysis.PlannedRun, ...]:
+    """Return what the method of a finished run, whose code waits for trust, and plain Monte Carlo need."""
+    recorded, asked = study.result, study.result.get("question")
+    described = recorded.get("method")
     name = described.get("name") if isinstance(described, Mapping) else None
-    if isinstance(asked, Mapping) and ":" in str(asked.get("method")):
-        name = asked["method"]
+    if ":" in str(name) or (isinstance(asked, Mapping) and ":" in str(asked.get("method"))):
+        name = open_run(study, trust).method
     p, cov, n_sim, seconds = (_read_number(recorded, each) for each in ("p", "cov", "n_sim", "seconds"))
     with as_bad_input(ValueError):
         method = arguments.find_method(name if isinstance(name, str) else reprlib.repr(name))

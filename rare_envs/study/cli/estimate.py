@@ -29,7 +29,7 @@ OPTIONS = frozenset(
     "horizon chunk workers executor address time_limit memory_limit config env_config out force details as_json".split()
 )
 """Options, typed or of a file, that HighwayEnv's environments have; the others are of the batched simulation."""
-PLANNED = frozenset({"env", "config", "plan", "target_cov", "as_json"})
+PLANNED = frozenset({"env", "config", "plan", "target_cov", "as_json", "trust"})
 """Options of a plan from the folder of a run, in which nothing is simulated."""
 UNPLANNED = frozenset({"out", "force", "details", "max_p", "max_rate", "assume_traffic", "workers", "env_config"})
 """Options that a plan by pilots does not use."""
@@ -215,7 +215,7 @@ def _plan(target: str, asked: dict[str, Any], typed: set[str]) -> Answer:
         why = "the folder of a run without it: nothing is simulated" if folder else "--plan without it"
         raise BadInput(f"--{refused[0].replace('_', '-')} has no use here. Expected {why}.")
     if folder:
-        found = plan_from_result(load_finished(Path(target)).result, cov)
+        found = plan_from_result(load_finished(Path(target)), cov, asked["trust"])
     else:
         try:
             find_scenario(target)

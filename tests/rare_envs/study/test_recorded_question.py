@@ -15,8 +15,11 @@ import numpy as np
 import pytest
 
 import agents
+import rare_envs
+from rare_envs.problem import DrivingProblem
 from rare_envs.study import BadInput, Question, prepare, run_into
-from rare_envs.study.arguments import read_question
+from rare_envs.study.arguments import RunInterrupted, read_question
+from rare_envs.study.compared_risks import compare_risks
 from rare_envs.study.evaluate import resume
 from rare_envs.study.html_report import write_html_report
 from rare_envs.study.question import (
@@ -31,7 +34,7 @@ from rare_envs.study.question import (
 from rare_envs.study.replay import find_failure
 from rare_envs.study.run_folder import ANSWER, EPISODES, FAILURES, RESULT, RESULT_FILES, STUDY, load_study
 from rare_envs.study.writing import begin_journal
-from tests.rare_envs.study.refusals import FOLLOWING
+from tests.rare_envs.study.refusals import FOLLOWING, Cli, act_after, assert_refused
 
 EVIL = """
 from pathlib import Path
@@ -112,6 +115,70 @@ def test_a_received_run_is_neither_replayed_nor_resumed_without_trust(name: str,
         words = r"was not made here, and its question (runs code: 'evil:|connects to .*: '(tcp|hf):).*add --trust"
         with pytest.raises(BadInput, match=words):
             act()
+    assert not Path("was_here").exists()
+
+
+@pytest.mark.parametrize("command", ["risk", "compare", "compare sums"])
+@pytest.mark.parametrize("name", ["ego", "ego of B", "drivers", "base", "method", "measure", "also_under", "env_id"])
+def test_what_a_received_sum_or_comparison_names_runs_no_code(
+    command: str, name: str, received: Path, cli: Cli
+) -> None:
+    """The journals of sums ask nothing that needs trust: the arguments that they record do."""
+    options: dict[str, Any] = {"method": "mc", "max_sim": 200}
+    code = {"measure": "evil:gap", "env_id": "evil:rare_envs/HardBrake-v0"}.get(name, "evil:make")
+    asked = Question(env_id="rare_envs/HardBrake-v0", base="us101", ego="idm", **options)
+    sides = {"A": asked, "B": asked}
+    egos = {"ego": "idm", "ego_a": "idm", "ego_b": "idm"}
+    whole: dict[str, Any] = {"command": command, "scenarios": ["hard_brake"], "sites": ["us101"], "site": "us101"}
+    whole |= {"bases": {}, "chunked": False, "options": options, "b": {"algo_b": None, "stats_b": None}}
+    if command == "compare":
+        side, field = ("B", "ego") if name == "ego of B" else ("A", name)
+        sides[side], whole = replace(asked, **{field: code}), {"command": command}
+    elif name in ("ego", "ego of B"):
+        changed = {"ego": ["ego", "ego_a"], "ego of B": ["ego", "ego_b"]}[name]
+        whole |= egos | dict.fromkeys(changed, code)
+    else:
+        whole |= egos | {"scenarios": [code]} if name == "env_id" else egos
+        whole |= {"bases": {"HardBrake-v0": code}} if name == "base" else {}
+        whole |= {"options": {**options, name: code}} if name not in ("env_id", "base") else {}
+    parts = {"risk": {"hard_brake": asked}, "compare": sides, "compare sums": {"hard_brake/A": asked}}[command]
+    for part, question in parts.items():
+        Path("begun", part).mkdir(parents=True)
+        begin_journal(Path("begun", part), question, whole=whole).close()
+    assert_refused(cli("resume", "begun"), f"not made here, and its question runs code: {code!r}", "add --trust")
+    assert not Path("was_here").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sums", [rare_envs.risk, compare_risks])
+def test_a_sum_of_ones_own_goes_on_without_trust_and_that_of_others_with_it(
+    sums: Any, received: Path, tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    egos = ("evil:make",) if sums is rare_envs.risk else ("idm", "evil:make")
+    asked: dict[str, Any] = {"scenarios": ["hard_brake", "cut_in"], "method": "mc", "max_sim": 40, "seed": 0}
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(DrivingProblem, "tile", 5)
+    with monkeypatch.context() as patch, pytest.raises(RunInterrupted, match="rare-envs resume mine"):
+        act_after(10, stop, patch)
+        sums(*egos, **asked, out="mine")
+    for name in ("theirs", "trusted"):
+        shutil.copytree("mine", name)
+    assert cli("resume", "mine").exit_code in (0, 3)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "new"))
+    assert_refused(cli("resume", "theirs"), "not made here", "'evil:make'", "add --trust")
+    assert cli("resume", "trusted", "--trust").exit_code in (0, 3)
+
+
+def test_the_method_of_a_received_run_is_not_imported_for_a_plan(received: Path, cli: Cli) -> None:
+    change_question(received, method="evil:Coasting")
+    assert_refused(cli("estimate", received, "--plan"), "runs code: 'evil:Coasting'", "add --trust")
+    result = json.loads((received / RESULT).read_text())
+    result["method"]["name"], result["question"]["method"] = "evil:Coasting", "mc"
+    (received / RESULT).write_text(json.dumps(result))
+    assert cli("estimate", received, "--plan").exit_code == 0
     assert not Path("was_here").exists()
 
 
