@@ -145,7 +145,7 @@ def test_what_a_received_sum_or_comparison_names_runs_no_code(
     for part, question in parts.items():
         Path("begun", part).mkdir(parents=True)
         begin_journal(Path("begun", part), question, whole=whole).close()
-    assert_refused(cli("resume", "begun"), f"not made here, and its question runs code: {code!r}", "add --trust")
+    assert_refused(cli("resume", "begun"), "not made here, and its question runs code: 'evil:", "add --trust")
     assert not Path("was_here").exists()
 
 
