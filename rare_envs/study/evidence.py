@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import textwrap
@@ -26,7 +27,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from scipy.stats import poisson
 
-from rare_envs.files import digest_file, format_json, parse_json_object, read_text_file, replace_text
+from rare_envs.files import digest_file, format_json, open_ordinary, parse_json_object, read_text_file, replace_text
 from rare_envs.plugins import clean_text
 from rare_envs.study.arguments import as_bad_input, output_folder
 from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, list_columns
@@ -58,6 +59,10 @@ MOST_CASES = 20
 """Test cases at most."""
 ENOUGH_COV = 0.3
 """Largest relative standard error of p at which the simulations are called enough."""
+SUM_TOLERANCE = 1e-6
+"""Largest relative difference of p from the sum of weights, and of the rate from p times the frequency."""
+FACTOR = "Its contacts are {:.2g} times the nearest end of people's interval (1: inside); nothing was multiplied by it."
+"""How the human driver model compares with people."""
 CHECK_TAIL = 0.025
 """A recorded count is outside what the traffic model expects if a count as extreme has a smaller probability."""
 
@@ -123,6 +128,8 @@ class Leaf:
 def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> Status:
     """Return the status of a leaf of claims.json, from its file in the folder of the run.
 
+    A file whose digest is not that in manifest.json supports nothing; for test cases their own files count too.
+
     Raises:
         OSError: The file cannot be read.
         ValueError: It is no JSON object.
@@ -134,8 +141,31 @@ def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> Status:
         FileNotFoundError: [Errno 2] No such file or directory: 'runs/nowhere/result.json'
     """
     wanted = Leaf(**{name: leaf[name] for name in ("file", "pointer", "rule", "limit") if name in leaf})
-    path = folder / wanted.file
-    return wanted.judge(parse_json_object(read_text_file(path), repr(str(path))))
+    status = wanted.judge(_read(folder / wanted.file))
+    files = (wanted.file, f"{EVIDENCE}/test_cases/") if wanted.file.endswith(TEST_CASES) else (wanted.file,)
+    changed = status == "supported" and any(name.startswith(files) for name in find_changed(folder))
+    return "not supported" if changed else status
+
+
+def find_changed(folder: Path) -> list[str]:
+    """Return the result and files of the evidence, relative to a run's folder, that manifest.json has otherwise."""
+    filed, found = _read(folder / EVIDENCE / MANIFEST).get("sha256") or {}, _digest_files(folder)
+    return sorted(name for name in {**filed, **found} if found.get(name) != filed.get(name))
+
+
+def _digest_files(folder: Path) -> dict[str, str]:
+    """Return SHA-256 digests of the result of a run and of its evidence, but for the manifest that they stand in."""
+    digests = {}
+    for path in (folder / RESULT, *sorted((folder / EVIDENCE).rglob("*"))):
+        if path.is_file() and path.name != MANIFEST:
+            with open_ordinary(path) as file:
+                digests[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file."""
+    return parse_json_object(read_text_file(path), repr(str(path)))
 
 
 def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
@@ -153,7 +183,7 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
     """
     if (folder / RISK).is_file():
         with as_bad_input(OSError, ValueError):
-            names = parse_json_object(read_text_file(folder / RISK), repr(str(folder / RISK))).get("scenarios") or ()
+            names = _read(folder / RISK).get("scenarios") or ()
         return tuple(path for name in names for path in _write_evidence_of_run(folder / str(name), trust))
     return _write_evidence_of_run(folder, trust)
 
@@ -164,26 +194,39 @@ def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Path, ...]:
     prepared = prepare(open_run(study, trust))
     out = folder / EVIDENCE
     with output_folder(out, PAGE, *FILES, folders=("test_cases",)), as_bad_input(OSError, ValueError):
+        filed = find_changed(folder) if (out / MANIFEST).is_file() else []
         remove_evidence(folder)
         rows = list_failures(study)
         drives = [drive_again(prepared.problem, read_row(study.failures, prepared.problem, row)) for row in rows]
         content: dict[str, dict[str, Any]] = {
             COVERAGE: describe_coverage(prepared),
             UNCERTAINTY: list_uncertainty(study.result),
-            VALIDATION: validate(study, prepared, rows, drives),
+            VALIDATION: validate(study, prepared, rows, drives, filed),
             TRAFFIC: describe_traffic_model(prepared),
             TEST_CASES: write_test_cases(out, study, prepared, rows, drives),
             MANIFEST: describe_origin(study),
         }
         for name, value in content.items():
             replace_text(out / name, format_json(to_json_value(value)))
+        _seal(folder, content[MANIFEST])
         content[CLAIMS] = judge_claims(folder, build_claims(study.result))
         replace_text(out / CLAIMS, format_json(content[CLAIMS]))
         replace_text(out / PICTURE, draw_claims(content[CLAIMS]["nodes"]))
         replace_text(out / SCHEMA_FILE, format_json(SCHEMA))
         replace_text(out / PAGE, render(study, content, (out / PICTURE).read_text(encoding="utf-8")))
+        _seal(folder, content[MANIFEST])
     cases = [out / name for case in content[TEST_CASES]["cases"] for name in case["files"]]
     return (out / PAGE, *(out / name for name in (*FILES, PICTURE, SCHEMA_FILE)), *cases)
+
+
+def list_changes(files: Sequence[Path]) -> list[str]:
+    """Return the files of runs, or of earlier evidence, that evidence files found to be changed."""
+    return [name for path in files if path.name == VALIDATION for name in _read(path)["changed"]]
+
+
+def _seal(folder: Path, origin: Mapping[str, Any]) -> None:
+    """Write the manifest with the digests of the other files of the evidence as they are now."""
+    replace_text(folder / EVIDENCE / MANIFEST, format_json(to_json_value({**origin, "sha256": _digest_files(folder)})))
 
 
 def list_failures(study: LoadedStudy) -> list[int]:
@@ -211,7 +254,7 @@ def describe_coverage(study: Study) -> dict[str, Any]:
             "road": "motorway lanes, no junction",
             "lanes": len(road.edges) - 1,
             "lane_widths_m": [round(b - a, 3) for a, b in zip(road.edges, road.edges[1:], strict=False)],
-            "least_radius_m": None if curvature == 0 else round(1.0 / curvature, 1),
+            "least_radius_m": "straight" if curvature == 0 else round(1.0 / curvature, 1),
             "vehicles": list(scenario.labels),
             "drivers_of_others": question.drivers or scenario.drivers or "script of the scenario",
             "weather": "drawn" if question.weather else "none",
@@ -244,22 +287,32 @@ def list_uncertainty(result: Mapping[str, Any]) -> dict[str, Any]:
             "/base_uncertainty/interval" if known else "/base_uncertainty/bound",
         ),
     ]
+    upper, rate = sources[2]["interval_of_p"][1], result.get("rate") or {"determined": True}
+    sources[2]["limited"] = None if upper is None else bool(upper < 1 and rate["determined"])
     total = sum(variance.values())
     shares = {name: value / total for name, value in variance.items()} if total else {}
     calibration = [
         {
             "event": each["event"],
             "people_per_million_km": (each.get("people") or {}).get("interval_per_million_km"),
-            "human_model_factor": (each.get("calibration") or {}).get("factor"),
+            "human_driver_model": FACTOR.format(each["calibration"]["factor"]) if each.get("calibration") else None,
             "uncalibrated": each.get("uncalibrated"),
             # a factor of nothing says nothing
             "calibrated": not each["uncalibrated"] if (each.get("people") or {}).get("count") else None,
         }
         for each in events
     ]
+    unresolved, cov = _list_unresolved(result), result.get("cov")
+    sure = result.get("status") == "converged" and not unresolved
     return {
         "p": result["p"],
         "confidence": result["confidence"],
+        "simulations": {
+            "relative_error": cov,
+            "too_few_failures_in": unresolved,
+            "status": result.get("status"),
+            "enough": None if cov is None else bool(cov <= ENOUGH_COV and sure),
+        },
         "sources": sources,
         "shares_of_log_variance_of_the_rate": shares,
         "calibration": calibration,
@@ -268,15 +321,28 @@ def list_uncertainty(result: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _list_unresolved(result: Mapping[str, Any]) -> list[str]:
+    """Return the parts of the traffic with too few failures; that of cutters who do not look is called "unseen"."""
+    names = [str(part["name"]) for part in result.get("parts") or [] if not part["resolved"]]
+    return [name.replace("unseen", "no look") for name in names]
+
+
 def _source(name: str, what: str, interval: Sequence[float | None], pointer: str) -> dict[str, Any]:
     """Return a row of the budget."""
     return {"source": name, "what": what, "interval_of_p": list(interval), "file": RESULT, "pointer": pointer}
 
 
-def validate(study: LoadedStudy, prepared: Study, rows: Sequence[int], drives: Sequence[Drive]) -> dict[str, Any]:
-    """Return checks of the tool chain: failures driven again, two simulators compared, the run's own doubts."""
+def validate(
+    study: LoadedStudy, prepared: Study, rows: Sequence[int], drives: Sequence[Drive], changed: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return checks of the tool chain: failures driven again, simulators compared, sums, doubts, files changed."""
     recorded = np.array([study.failures["f"][row] for row in rows])
     found = np.array([drive.f for drive in drives])
+    sums, result = check_sums(study), study.result
+    forged = [f"{RESULT} (p or the rate does not follow from {study.episodes_path.name})"] if sums["differ"] else []
+    few = [f"{name}: too few failures found" for name in _list_unresolved(result)]
+    traffic = [f"traffic model: {text}" for text in (result.get("base_uncertainty") or {}).get("warnings") or []]
+    warnings = [*(result.get("doubts") or []), *(result.get("warnings") or []), *traffic, *few]
     differing = int(np.sum(~(np.abs(found - recorded) <= REPLAY_TOLERANCE)))
     return {
         "replays": {
@@ -288,8 +354,30 @@ def validate(study: LoadedStudy, prepared: Study, rows: Sequence[int], drives: S
             "tolerance": REPLAY_TOLERANCE,
         },
         "simulators": compare_simulators(prepared, [read_row(study.failures, prepared.problem, row) for row in rows]),
-        "files_changed": study.changed_files,
+        "sums": sums,
+        "warnings": list(dict.fromkeys(warnings)),
+        "files_changed": study.changed_files if study.about.get("results") else None,
+        "changed": [*study.changed_files, *forged, *changed],
     }
+
+
+def check_sums(study: LoadedStudy) -> dict[str, Any]:
+    """Return the relative difference of p from the sum of weights, or of the rate from p times frequency if larger.
+
+    None without weights, as of methods of Markov chains (ss, adss).
+    """
+    result, total = study.result, None
+    methods = [(result.get("method") or {}).get("name"), *(part["method"] for part in result.get("parts") or [])]
+    if study.episodes_path.is_file() and not {"ss", "adss"} & set(", ".join(map(str, methods)).split(", ")):
+        weights = study.episodes(["log_weight"], failed=True)["log_weight"].drop_null().to_numpy()
+        total = float(np.exp(weights).sum()) if len(weights) or study.p == 0 else None
+    pairs = [] if total is None else [(study.p, total)]
+    if rate := result.get("rate"):
+        count = rate["frequency"]
+        pairs.append((rate["per_million_km"], 1e6 * count["count"] / count["km"] * count["share"] * study.p))
+    largest = max((abs(a - b) / max(abs(a), abs(b), 1e-300) for a, b in pairs), default=0.0)
+    differ = largest > SUM_TOLERANCE
+    return {"sum": total, "difference": None if total is None and not differ else largest, "differ": differ}
 
 
 def compare_simulators(study: Study, failures: Sequence[FloatArray]) -> dict[str, Any]:
@@ -399,7 +487,6 @@ def describe_origin(study: LoadedStudy) -> dict[str, Any]:
         "command": about.get("command"),
         **{name: about.get(name) for name in ("begun", "finished", "seed", "ego", "base", "versions", "files")},
         "blake2b": {name: digest_file(study.folder / name) for name in names},
-        "files_changed": len(study.changed_files) if about.get("results") else None,
     }
 
 
@@ -409,20 +496,26 @@ def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     ego, env_id = question["ego"], question["env_id"]
     level = f"{100 * result['confidence']:g} %"
     high = _find_upper_limit(result)
-    top = f"{ego} fails in at most {format_probability(high)} of the scenarios of {env_id} ({level})"
+    limit = f"Upper limit {format_probability(high)} per scenario"
     if rate is not None:
-        most = format_rate(rate["interval_per_million_km"][1])
-        top = f"{ego} collides at most {most} times per million km in {env_id} ({level})"
+        limit = f"Upper limit {format_rate(rate['interval_per_million_km'][1])} per million km"
+    if high >= 1:
+        limit = "No upper limit"
+    gate = result.get("gate")
+    decision = "no acceptance limit was set"
+    if gate:
+        decision = f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}"
+    top = f"{limit}; {decision} ({ego} in {env_id}, {level})"
     evidence = f"{EVIDENCE}/"
     events = result.get("events") or []
     goals: dict[str, list[tuple[str, Leaf]]] = {
         "S1 Argue over each source of uncertainty": [
+            *([("The limit is met", Leaf(RESULT, "/gate/decision", "equals", "passes"))] if gate else []),
             (
-                f"Enough simulations: relative error of p at most {ENOUGH_COV:g}",
-                Leaf(RESULT, "/cov", "at most", ENOUGH_COV),
+                f"Enough simulations in each part of the traffic: relative error of p at most {ENOUGH_COV:g}",
+                Leaf(evidence + UNCERTAINTY, "/simulations/enough", "equals", True),
             ),
-            ("A crash type that was missed is rarer than the upper limit", Leaf(RESULT, "/unseen", "at most", high)),
-            ("Recorded events limit p", Leaf(evidence + UNCERTAINTY, "/sources/2/interval_of_p/1", "known")),
+            ("Recorded events limit p", Leaf(evidence + UNCERTAINTY, "/sources/2/limited", "equals", True)),
             *[
                 (
                     f"A human driver model is within a factor 3 of people's interval ({each['event']})",
@@ -433,14 +526,21 @@ def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
         ],
         "S2 Argue over the tool chain": [
             ("Failures replay", Leaf(evidence + VALIDATION, "/replays/differing", "equals", 0)),
-            ("Two simulators agree", Leaf(evidence + VALIDATION, "/simulators/failures_differing", "equals", 0)),
+            (
+                "Two implementations of one model agree",
+                Leaf(evidence + VALIDATION, "/simulators/failures_differing", "equals", 0),
+            ),
             ("The traffic model expects what was recorded", Leaf(evidence + TRAFFIC, "/checks_outside", "equals", 0)),
-            ("The run has no warning", Leaf(RESULT, "/doubtful", "equals", False)),
+            ("The run has no warning", Leaf(evidence + VALIDATION, "/warnings", "equals", [])),
         ],
         "S3 Argue over what is filed": [
+            (
+                "p is the sum of the weights of the failing episodes, and the rate p times their frequency",
+                Leaf(evidence + VALIDATION, "/sums/difference", "at most", SUM_TOLERANCE),
+            ),
             ("Each crash mode has a test case", Leaf(evidence + TEST_CASES, "/modes_without_case", "equals", 0)),
             ("The run can be made again", Leaf(evidence + MANIFEST, "/command", "known")),
-            ("The files are those that the run wrote", Leaf(evidence + MANIFEST, "/files_changed", "equals", 0)),
+            ("The files are those that the run wrote", Leaf(evidence + VALIDATION, "/files_changed", "equals", [])),
         ],
     }
     nodes: list[dict[str, Any]] = [
@@ -518,7 +618,8 @@ def draw_claims(nodes: Sequence[Mapping[str, Any]]) -> str:
 def _draw_node(axes: Any, node: Mapping[str, Any], x: float, y: float, width: float) -> None:
     """Draw a node: a box with its id, text and status; a leaf has round ends, as in GSN."""
     style = "round4" if node["kind"] == "solution" else "square"
-    mark = f"{node['id']}  {node['text']}" + (f"  [{node['status']}]" if node.get("status") else "")
+    below = "" if node["supports"] else "all below: "
+    mark = f"{node['id']}  {node['text']}" + (f"  [{below}{node['status']}]" if node.get("status") else "")
     text = textwrap.fill(clean_text(mark), int(width * 13.5))
     axes.text(
         *(x + 0.06, y, text),

@@ -191,15 +191,18 @@ def report_command(
     force: ForceOption = False,
 ) -> Answer:
     """Write the report of a run, a risk or a comparison as one HTML file, with films of its failures."""
-    from rare_envs.study.evidence import write_evidence
+    from rare_envs.study.evidence import list_changes, write_evidence
     from rare_envs.study.html_report import write_html_report
 
     refuse_existing(force, out, out and out.parent / "figures" if figures else None)
     page, *drawn = write_html_report(folder, events=events, out=out, figures=figures, **asked)
-    filed = [str(path) for path in (write_evidence(folder, **asked) if evidence else ())]
+    files = write_evidence(folder, **asked) if evidence else ()
+    filed, changed = [str(path) for path in files], list_changes(files)
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
     text += "".join(f"\nWrote {path} and the files beside it." for path in filed if path.endswith(".html"))
-    return Answer({"report": str(page), "figures": [str(path) for path in drawn], "evidence": filed}, text)
+    text += f"\nChanged since they were written: {', '.join(changed)}." if changed else ""
+    data = {"report": str(page), "figures": [str(path) for path in drawn], "evidence": filed, "changed": changed}
+    return Answer(data, text, DOUBTFUL if changed else 0)
 
 
 @command("trust")

@@ -1,6 +1,7 @@
 """Evidence of a run: every claim can be judged again from its file, and says so when the file no longer supports it."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +11,10 @@ import jsonschema
 import pytest
 from typer.testing import Result
 
+from rare_envs.files import digest_file
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.evidence import CELLS, EVIDENCE, FILES, SCHEMA, judge_leaf, write_evidence
-from rare_envs.study.run_folder import RESULT
+from rare_envs.study.evidence import CELLS, EVIDENCE, FILES, SCHEMA, find_changed, judge_leaf, write_evidence
+from rare_envs.study.run_folder import RESULT, STUDY
 
 
 def make_run(folder: Path, **settings: object) -> Path:
@@ -57,14 +59,75 @@ def test_a_claim_is_supported_where_all_below_it_is(run: Path) -> None:
 
 @pytest.mark.parametrize(
     ("pointer", "change"),
-    [("/unseen", {"unseen": 0.9}), ("/doubtful", {"doubtful": True}), ("/cov", {"cov": None})],
+    [
+        ("/sources/2/limited", {"base_uncertainty": {"bound": 1.0, "interval": None}}),
+        ("/sources/2/limited", {"rate": {"determined": False}}),
+        ("/simulations/enough", {"cov": None}),
+        ("/simulations/enough", {"status": "budget"}),
+        ("/simulations/enough", {"parts": [{"name": "unseen", "resolved": False, "method": "mc"}]}),
+        ("/warnings", {"parts": [{"name": "unseen", "resolved": False, "method": "mc"}]}),
+        ("/sums/difference", {"p": 1e-8}),
+        ("/sums/difference", {"rate": {"per_million_km": 0.1}}),
+        ("/gate/decision", {"gate": {"decision": "fails", "limit": 1.0, "quantity": "p"}}),
+    ],
 )
-def test_a_changed_file_changes_the_status(run: Path, tmp_path: Path, pointer: str, change: dict[str, object]) -> None:
+def test_a_result_that_says_less_supports_less(
+    run: Path, tmp_path: Path, pointer: str, change: dict[str, dict[str, object]]
+) -> None:
     copy = shutil.copytree(run, tmp_path / "copy")
-    result = json.loads((copy / RESULT).read_text(encoding="utf-8"))
-    (copy / RESULT).write_text(json.dumps({**result, **change}), encoding="utf-8")
-    (leaf,) = (each for each in read(run)["claims.json"]["nodes"] if each.get("pointer") == pointer)  # type: ignore
-    assert judge_leaf(copy, leaf) != "supported"
+    sign_again(copy, change)
+    before, after = (
+        {each["pointer"]: each["status"] for each in read(folder)["claims.json"]["nodes"] if "pointer" in each}  # type: ignore
+        for folder in (run, copy)
+        if folder == run or write_evidence(folder)
+    )
+    assert before.get(pointer, "supported") == "supported" and after[pointer] != "supported"
+
+
+def sign_again(folder: Path, change: dict[str, dict[str, object]]) -> None:
+    """Edit result.json, and its digest in study.json as a forger would."""
+    result, about = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (RESULT, STUDY))
+    for name, value in change.items():
+        result[name] = {**(result[name] or {}), **value} if isinstance(value, dict) else value
+    (folder / RESULT).write_text(json.dumps(result), encoding="utf-8")
+    about["results"][RESULT] = digest_file(folder / RESULT)
+    (folder / STUDY).write_text(json.dumps(about), encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["validation.json", "test_cases/00.xosc"])
+@pytest.mark.parametrize("removed", [True, False])
+def test_a_changed_file_of_the_evidence_supports_nothing_and_is_named(
+    run: Path, tmp_path: Path, cli: Callable[..., Result], name: str, removed: bool
+) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    path, claims = copy / EVIDENCE / name, read(run)["claims.json"]["nodes"]
+    if removed:
+        path.unlink()
+    else:
+        path.write_text(path.read_text(encoding="utf-8") + " ", encoding="utf-8")
+    assert find_changed(copy) == [f"{EVIDENCE}/{name}"]
+    used = "test_cases.json" if name.startswith("test_cases/") else name
+    for leaf in (each for each in claims if each.get("file") == f"{EVIDENCE}/{used}"):  # type: ignore[attr-defined]
+        if path.suffix == ".json" and removed:
+            with pytest.raises(FileNotFoundError):
+                judge_leaf(copy, leaf)
+        else:
+            assert judge_leaf(copy, leaf) == "not supported"
+    assert cli("report", copy, "--evidence").exit_code == 3
+    assert f"no evidence: {EVIDENCE}/{name}." in (copy / EVIDENCE / "evidence.html").read_text(encoding="utf-8")
+    assert cli("report", copy, "--evidence").exit_code == 0  # written anew
+
+
+def test_no_limit_is_claimed_where_there_is_none(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    assert re.match(r"Upper limit \S+ per million km; no acceptance limit was set", first_claim(run))
+    sign_again(copy, {"base_uncertainty": {"bound": 1.0, "interval": None}})
+    write_evidence(copy)
+    assert first_claim(copy).startswith("No upper limit; ")
+
+
+def first_claim(folder: Path) -> str:
+    return str(read(folder)["claims.json"]["nodes"][0]["text"])  # type: ignore[index]
 
 
 def test_test_cases_are_the_likeliest_failures_with_a_road_each(run: Path) -> None:
