@@ -159,7 +159,7 @@ def _digest_files(folder: Path) -> dict[str, str]:
     for path in (folder / RESULT, *sorted((folder / EVIDENCE).rglob("*"))):
         if path.is_file() and path.name != MANIFEST:
             with open_ordinary(path) as file:
-                digests[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+                digests[path.relative_to(folder).as_posix()] = hashlib.sha256(file.read()).hexdigest()
     return digests
 
 
