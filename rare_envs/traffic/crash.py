@@ -26,7 +26,7 @@ MPH = 2.2369362920544
 """Miles per hour in a metre per second."""
 MAIS3 = {"all": (-6.9540, 0.1637), "frontal": (-6.9774, 0.1620), "rear": (-8.0329, 0.1793)}
 """Intercept and slope per mph of delta-v, by crash mode; see `injury_risk`."""
-NumberT = TypeVar("NumberT", float, Tensor)
+ValueT = TypeVar("ValueT", float, Tensor)
 _ROUNDING = 1e-4
 """Bodies that overlap in single precision are no further apart than this [m]."""
 
@@ -81,7 +81,7 @@ class Crash(NamedTuple):
         )
 
 
-def injury_risk(delta_v: NumberT, mode: str = "all") -> NumberT:
+def injury_risk(delta_v: ValueT, mode: str = "all") -> ValueT:
     """Return the probability of a serious injury (MAIS 3 or more) of an occupant by delta-v [m/s], any shape.
 
     Logistic, 1 / (1 + exp(-(a + b delta-v))), from tow-away crashes of light vehicles in the United States, 2010 to
