@@ -492,20 +492,7 @@ def describe_origin(study: LoadedStudy) -> dict[str, Any]:
 
 def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the nodes of the claim tree of a run, parents first."""
-    question, rate = result["question"], result.get("rate")
-    ego, env_id = question["ego"], question["env_id"]
-    level = f"{100 * result['confidence']:g} %"
-    high = _find_upper_limit(result)
-    limit = f"Upper limit {format_probability(high)} per scenario"
-    if rate is not None:
-        limit = f"Upper limit {format_rate(rate['interval_per_million_km'][1])} per million km"
-    if high >= 1:
-        limit = "No upper limit"
     gate = result.get("gate")
-    decision = "no acceptance limit was set"
-    if gate:
-        decision = f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}"
-    top = f"{limit}; {decision} ({ego} in {env_id}, {level})"
     evidence = f"{EVIDENCE}/"
     events = result.get("events") or []
     goals: dict[str, list[tuple[str, Leaf]]] = {
@@ -544,7 +531,7 @@ def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
         ],
     }
     nodes: list[dict[str, Any]] = [
-        {"id": "G1", "kind": "goal", "text": top, "supports": None},
+        {"id": "G1", "kind": "goal", "text": _describe_limit(result), "supports": None},
         {"id": "C1", "kind": "context", "text": f"Covered: {evidence}{COVERAGE}", "supports": "G1"},
         {"id": "A1", "kind": "assumption", "text": "The family of the traffic model is right", "supports": "G1"},
     ]
@@ -556,6 +543,24 @@ def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
             nodes.append({"id": f"G{number}", "kind": "goal", "text": claim, "supports": own})
             nodes.append({"id": f"Sn{number}", "kind": "solution", "supports": f"G{number}", **_name_leaf(leaf)})
     return nodes
+
+
+def _describe_limit(result: Mapping[str, Any]) -> str:
+    """Return what the top claim says: the upper limit of a run, and what a gate decided of it."""
+    question, rate = result["question"], result.get("rate")
+    ego, env_id = question["ego"], question["env_id"]
+    level = f"{100 * result['confidence']:g} %"
+    high = _find_upper_limit(result)
+    limit = f"Upper limit {format_probability(high)} per scenario"
+    if rate is not None:
+        limit = f"Upper limit {format_rate(rate['interval_per_million_km'][1])} per million km"
+    if high >= 1:
+        limit = "No upper limit"
+    gate = result.get("gate")
+    decision = "no acceptance limit was set"
+    if gate:
+        decision = f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}"
+    return f"{limit}; {decision} ({ego} in {env_id}, {level})"
 
 
 def _name_leaf(leaf: Leaf) -> dict[str, Any]:
