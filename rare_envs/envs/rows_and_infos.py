@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 ROWS_AHEAD = 256
 """Scenarios that are drawn at once: a few cost as much as these."""
+REDRAWS = 100
+"""Draws of the other parameters beside given ones before these are refused."""
 DRAWS_IN_A_ROW = (TruncatedGaussianMixture, BetaDistribution, StratifiedDistribution)
 """Distributions whose draws of m rows and then of n are those of m + n rows."""
 
@@ -47,16 +49,32 @@ def draw_scenarios(
     rng: np.random.Generator,
     draw: Callable[[int, np.random.Generator], FloatArray] | None = None,
 ) -> FloatArray:
-    """Return scenarios as by `ScenarioSpace.scenario_x`; refuse options with which vehicles begin in each other."""
+    """Return scenarios as by `ScenarioSpace.scenario_x`, in which no vehicles begin in each other.
+
+    Where given values put one into another, the others are drawn again; what cannot be set apart is refused.
+    """
     x = space.scenario_x(options, n, rng, draw)
-    if options:
-        own = torch.from_numpy(x).float()[:, : next(iter(world.columns.values()))]
-        touch = overlaps(world.scenario.initial(own), world.scenario.road, "all").nonzero().tolist()
-        if touch:
-            one, other = (world.scenario.labels[of[touch[0][1]]] for of in pairs(world.scenario.vehicles))
-            row = f" (row {touch[0][0]})" if n > 1 else ""
-            raise ValueError(f"Expected vehicles apart at the start, got {other} in {one}{row}; change gaps or places.")
+    if not options:
+        return x
+    contacts = _find_contacts(world, x)
+    for _ in range(0 if "x" in options else REDRAWS):
+        if not contacts.any():
+            break
+        rows = contacts.any(1).numpy()
+        x[rows] = space.scenario_x(options, n, rng, draw)[rows]
+        contacts = _find_contacts(world, x)
+    if contacts.any():
+        first, pair = contacts.nonzero()[0].tolist()
+        one, other = (world.scenario.labels[of[pair]] for of in pairs(world.scenario.vehicles))
+        row = f" (row {first})" if n > 1 else ""
+        raise ValueError(f"Expected vehicles apart at the start, got {other} in {one}{row}; change gaps or places.")
     return x
+
+
+def _find_contacts(world: World, x: FloatArray) -> Tensor:
+    """Return which pairs of vehicles begin in each other, (n, pairs)."""
+    own = torch.from_numpy(x).float()[:, : next(iter(world.columns.values()))]
+    return overlaps(world.scenario.initial(own), world.scenario.road, "all")
 
 
 class DrawsAhead:
