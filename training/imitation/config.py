@@ -19,7 +19,6 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     ("clone_weight clone_rate policy_rate", lambda value: 0 < value < math.inf, "> 0"),
     ("epochs warm_up weight_decay", lambda value: 0 <= value < math.inf, ">= 0"),
     ("critic_weight collision_weight edge_weight brake_weight", lambda value: 0 <= value < math.inf, ">= 0"),
-    ("headway_weight lane_weight speed_weight", lambda value: 0 <= value < math.inf, ">= 0"),
 )
 """Names of settings, the condition on each value, and its text. Schedules of weights are geometric, so not 0."""
 
@@ -81,12 +80,6 @@ class Config:
     """Weight of leaving the road in the cost."""
     brake_weight: float = 1.0
     """Weight of hard braking in the cost."""
-    headway_weight: float = 0.0
-    """Weight of following closely, which people do: 0 for drivers of the traffic, as the next two."""
-    lane_weight: float = 0.0
-    """Weight of being away from the middle of the lane."""
-    speed_weight: float = 0.0
-    """Weight of exceeding the speed limit."""
 
     # optimisation
     policy_rate: float = 3e-4

@@ -23,10 +23,8 @@ from torch import Tensor
 from agents.learned.networks import AutoregressiveNoise, Policy
 from rare_envs.sensors.lidar import (
     AHEAD_BEAM,
-    LANE_OFFSET_COLUMN,
     RANGE_COLUMNS,
     RATE_COLUMNS,
-    SPEED_COLUMN,
     Bodies,
     OnRoad,
     perceive,
@@ -51,18 +49,6 @@ EDGE_DISTANCE = 1.0
 """Distance [m] from the middle of the vehicle to the edge of the road below which it costs."""
 GENTLE_BRAKING = 2.0
 """Deceleration [m/s^2] of the vehicle itself that costs nothing."""
-HEADWAY, STANDSTILL = 1.2, 2.0
-"""Gap that costs nothing to vehicles ahead that reach into the own path: so many seconds [s] and metres [m]."""
-COMFORTABLE_APPROACH = 3.0
-"""Deceleration [m/s^2] by which the own speed first comes down to theirs; the way that this takes is no gap."""
-MAX_HEADWAY_COST = 2.0
-"""Greatest cost of following closely."""
-CENTRE_TOLERANCE = 0.3
-"""Distance [m] from the middle of the lane that costs nothing."""
-SPEED_LIMIT, SPEEDING_SCALE = 29.0, 10.0
-"""Speed that costs nothing, the limit of US 101 (65 mph), and that above it that costs 1 [m/s]."""
-
-
 ACTION_LOW, ACTION_HIGH = (-8.0, -0.3), (4.0, 0.3)
 """Bounds of acceleration [m/s^2] and yaw rate [rad/s]."""
 
@@ -249,9 +235,6 @@ class Penalties(NamedTuple):
     collision: Tensor
     edge: Tensor
     brake: Tensor
-    headway: Tensor
-    lane: Tensor
-    speed: Tensor
 
 
 def total_cost(config: Config, likeness: Tensor, costs: Penalties) -> Tensor:
@@ -276,17 +259,10 @@ def compute_penalties(traffic: Traffic, features: Tensor, action: Tensor) -> Pen
     gap = (features[..., RANGE_COLUMNS][..., AHEAD_BEAM] - 0.5 * length[:, :m]).clamp(min=LEAST_GAP)
     closing = (-features[..., RATE_COLUMNS][..., AHEAD_BEAM]).clamp(min=0.0)
     needed = closing.square() / (2.0 * gap)
-    own = traffic.speed[:, :m, None]  # a short headway to whoever is ahead, or closing on it
-    approach = (own - traffic.speed[:, None, :]).clamp(min=0.0).square() / (2.0 * COMFORTABLE_APPROACH)
-    short = 1.0 - (along - approach) / (STANDSTILL + HEADWAY * own)
-    reaches = (1.0 - across / NEAR_ACROSS).clamp(0.0, 1.0) * (x[:, None, :] > x[:, :m, None])
     return Penalties(
         collision=contact + BRAKING_SHARE * (needed - COMFORTABLE_BRAKING).clamp(0.0, MAX_EXCESS_BRAKING),
         edge=(EDGE_DISTANCE - torch.minimum(y[:, :m] - edges[:, :1], edges[:, -1:] - y[:, :m])).clamp(min=0.0),
         brake=(-action[..., 0] - GENTLE_BRAKING).clamp(min=0.0),
-        headway=(short.clamp(0.0, MAX_HEADWAY_COST) * reaches).amax(dim=2),
-        lane=(features[..., LANE_OFFSET_COLUMN].abs() - CENTRE_TOLERANCE).clamp(min=0.0),
-        speed=(features[..., SPEED_COLUMN] - SPEED_LIMIT).clamp(min=0.0) / SPEEDING_SCALE,
     )
 
 

@@ -158,10 +158,8 @@ def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = 
     return Data(recording, pairs, stack_scenes(test) if test else None)
 
 
-def make_learner(data: Data, config: Config, among: torch.Tensor | None = None, device: torch.device = CPU) -> Learner:
-    """Return a training before its first update: a cloned policy and a new critic.
-
-    The scenes `among` (k,), with repetition, are driven; None for all that have pairs.
+def make_learner(data: Data, config: Config, device: torch.device = CPU) -> Learner:
+    """Return a training before its first update: a cloned policy and a new critic; scenes that have pairs are driven.
 
     Example:
         >>> from training.data import scenes_of, synthetic_traffic
@@ -175,8 +173,7 @@ def make_learner(data: Data, config: Config, among: torch.Tensor | None = None, 
     pairs = Pairs(*(field.to(device) for field in data.pairs))
     policy = clone_policy(pairs, config, generator)
     critic = make_seeded(make_critic, generator).to(device)
-    among = torch.unique(pairs.scene) if among is None else among.to(device)
-    return Learner(config, recording, among, pairs, policy, critic, generator)
+    return Learner(config, recording, torch.unique(pairs.scene), pairs, policy, critic, generator)
 
 
 def train_learner(

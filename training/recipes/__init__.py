@@ -1,1 +1,1 @@
-"""Recipes: how each file that is shipped was made, one script for each."""
+"""Recipes: the bases and the road of the package from recordings, and the model card of its drivers."""

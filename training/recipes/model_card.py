@@ -38,8 +38,8 @@ TRAFFIC = {
     "third. `training/egos` of 8dec38c6 has the code of its commands.",
 }
 MEASURED = (
-    "Both were measured in ordinary traffic (below), and in every scenario as it stands: p of a collision is in "
-    "[docs/results.md](../../docs/results.md#egos)."
+    "Both were measured in ordinary traffic (below, `benchmarks/driving/ordinary_traffic.py`), and in every scenario "
+    "as it stands: p of a collision is in [docs/results.md](../../docs/results.md#egos)."
 )
 HEAD = (
     "Written by `python -m training.recipes.model_card` from the headers of the files. Load one with "
@@ -67,7 +67,7 @@ def format_model_card(folder: Path) -> str:
         *(("## Traffic of the egos", *egos, MEASURED) if egos else ()),
         *(
             "## Training",
-            "By commands of the version of that time; those of today are in `training/recipes`.",
+            "By commands of the version of that time.",
             commands,
         ),
         *("## Metrics", _table("metric", metrics)),

@@ -82,18 +82,6 @@ def test_penalties_on_paper():
     assert compute_penalties(traffic, features, torch.zeros(1, 1, 2)).collision == pytest.approx(0.1)
 
 
-def test_manners_cost_on_paper():
-    """Distance to whoever reaches into the own path, the middle of the lane, and the limit."""
-    traffic, features = moment([0.0, 20.5, 14.5], [1.8, 1.8, 4.2], [30.0, 24.0, 30.0])
-    features[0, :, 0], features[0, :, 2] = torch.tensor([0.0, -0.2, 0.6]), traffic.speed[0]
-    cost = compute_penalties(traffic, features, torch.zeros(1, 3, 2))
-    # 16 m to the lead, less 6 in which to slow down at 3 m/s^2, of 2 + 1.2 * 30 m. The third is as near to it,
-    # but, 0.4 m beside its path, only half in it
-    assert cost.headway[0].tolist() == pytest.approx([1 - 10 / 38, 0.0, 0.5 * (1 - (1.5 - 6) / 38)])
-    assert cost.lane[0].tolist() == pytest.approx([0.0, 0.0, 0.3])
-    assert cost.speed[0].tolist() == pytest.approx([0.1, 0.0, 0.1])
-
-
 def test_the_gradient_of_a_rollout_is_that_of_finite_differences(recording):
     recording = Recording(*(field.double() if field.is_floating_point() else field for field in recording))
     policy = Policy(scaling_of(collect_pairs(stack_scenes(scenes())))).double()

@@ -1,4 +1,8 @@
-"""Ordinary traffic, in which an ego that drives properly is safe for minutes, whether an ego does, and its correction.
+"""Does an ego drive properly in ordinary traffic, in which one that does is safe for minutes?
+
+    python -m benchmarks.driving.ordinary_traffic --ego imitation
+
+prints one JSON object: by case the rollouts passed and judged, the lower limit of a 95 % interval, the other verdicts.
 
 The ego follows a lead in the middle of several lanes, with a follower behind it and a vehicle in each lane beside it.
 All of them keep to their lanes. Their speeds vary as recorded ones do, and a vehicle that approaches another brakes.
@@ -12,18 +16,20 @@ way.
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
+import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents import load_driver
+from agents import load_driver, load_ego
 from agents.learned.driver import RuleDriver
 from agents.learned.networks import HUMAN_NOISE
 from rare_envs.distributions.space import Parameter
@@ -274,3 +280,16 @@ def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, A
         least = clopper_pearson(passed, judged, 0.95)[0] if judged else 0.0
         found[case] = {"passed": passed, "judged": judged, "at least": least, **counts}
     return found
+
+
+def main(
+    ego: Annotated[str, typer.Option(help="As for rare-envs estimate.")] = "imitation",
+    rollouts: Annotated[int, typer.Option(help="Of a minute each, in each case.")] = 400,
+    seed: Annotated[int, typer.Option(help="Of the starts and of all noise.")] = 1000,
+) -> None:
+    """Judge an ego in ordinary traffic."""
+    typer.echo(json.dumps(judge_all_cases(load_ego(ego), rollouts, seed), indent=1))
+
+
+if __name__ == "__main__":
+    typer.run(main)
