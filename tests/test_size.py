@@ -14,7 +14,7 @@ LIMITS = {
     "package lines": 57_900,
     "code lines": 36_800,
     "modules": 214,
-    "functions": 3_230,
+    "functions": 3_235,
     "classes": 474,
     "import lines, percent of code": 10.4,
     "test lines": 34_100,

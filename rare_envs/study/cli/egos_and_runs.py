@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import time
 from collections import Counter
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.study.arguments import BadInput, Question, as_bad_input, output_file, output_folder, refuse_existing
 from rare_envs.study.cli import options
 from rare_envs.study.cli.options import EGO_FILE, ForceOption, RunArgument, command
@@ -149,8 +151,15 @@ def fit_command(
     settings: dict[str, Any] = {"scenarios": scenarios, "name": name, "n_refits": refits, "seed": seed, "force": force}
     with output_folder(out), as_bad_input(ValueError, OSError):
         files = fit_bases(recordings, out, cut_gaps=cut_gaps, progress=True, **settings)
-    lines = [f"{path}: rare-envs estimate ENV --base {path}" for path in files]
+    lines = [f"{path}: rare-envs estimate {_name_scenario(path)} --base {path}" for path in files]
     return Answer({"bases": [str(path) for path in files]}, "\n".join(lines))
+
+
+def _name_scenario(path: Path) -> str:
+    """Return the id of the scenario whose parameters a traffic model has, as it is typed."""
+    names = json.loads(path.read_text(encoding="utf-8"))["names"]
+    (found,) = (each for each in SCENARIOS if [p.name for p in find_scenario(each).parameters] == names)
+    return found.removeprefix("rare_envs/")
 
 
 @command(*options.SCENARIO, *EGO_FILE, "trust")

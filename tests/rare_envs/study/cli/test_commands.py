@@ -145,21 +145,22 @@ def test_an_ego_is_trained_in_all_scenarios_of_risk(cli: Cli, tmp_path: Path) ->
 
 def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: dict[str, Any] = {}
-    file = tmp_path / "cut_in_own.json"
+    file = tmp_path / "car_following_own.json"
 
     def fit(recordings: Any, out: Path, **options: Any) -> list[Path]:
         asked.update(options, kind=recordings.kind_and_path()[0], between=recordings.between)
         print("progress")
+        file.write_text(json.dumps({"names": ["ego_speed", "lead_speed", "gap"]}))
         return [out / file.name]
 
     monkeypatch.setattr(fitting, "fit_bases", fit)
-    words = ("--i24", "morning.json", "--between", 1, 2, "--scenario", "cut_in", "--refits", 3, "--out", tmp_path)
+    words = ("--i24", "a.json", "--between", 1, 2, "--scenario", "car_following", "--refits", 3, "--out", tmp_path)
     answer = cli("fit", *words, "--json")
     assert json.loads(answer.stdout) == {"bases": [str(file)]}
     assert "progress" in answer.stderr
-    given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["cut_in"], "n_refits": 3}
+    given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["car_following"], "n_refits": 3}
     assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True, "force": False}
-    assert cli("fit", *words, "--force").stdout == f"{file}: rare-envs estimate ENV --base {file}\n"
+    assert cli("fit", *words, "--force").stdout == f"{file}: rare-envs estimate CarFollowing-v0 --base {file}\n"
 
 
 def test_an_ego_is_checked_in_the_traffic_that_is_asked_for(cli: Cli) -> None:
