@@ -11,13 +11,13 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_900,
-    "code lines": 36_800,
+    "package lines": 57_880,
+    "code lines": 36_780,
     "modules": 214,
-    "functions": 3_235,
-    "classes": 474,
+    "functions": 3_227,
+    "classes": 472,
     "import lines, percent of code": 10.4,
-    "test lines": 34_100,
+    "test lines": 34_060,
     "pages": 18,
     "words of pages": 37_100,
     "files entered by an estimate": 43,
