@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -26,7 +25,6 @@ from samplers.output import (
     LABEL,
     Kept,
     Row,
-    drawing_axes,
     fold_rows,
     format_alike,
     indent_lines,
@@ -44,7 +42,6 @@ __all__ = ["Comparison"]
 
 if TYPE_CHECKING:
     import pyarrow
-    from matplotlib.axes import Axes
 
 RATIO_COARSE = "the ratio is imprecise"
 """Words of the warnings that say how imprecise the ratio is, which its interval includes."""
@@ -165,30 +162,6 @@ class Comparison(Kept):
         """Intervals of `shares`, each by itself."""
         low, high = self.either.interval
         return {**{name: side.interval for name, side in self.parts.items()}, "neither": (1.0 - high, 1.0 - low)}
-
-    def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
-        """Draw p of A, of B and of both with their intervals, p on a log scale; needs matplotlib.
-
-        Args:
-            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
-
-        Raises:
-            ValueError: If neither failed.
-        """
-        if self.a.p == 0 and self.b.p == 0:
-            raise ValueError("There is nothing to draw: neither A nor B failed; give more simulations.")
-        ends = [end for side in (self.a, self.b) for end in (side.p, *side.interval) if end > 0]
-        floor = min(ends) / 10  # an end of 0 has no place on a log scale
-        with drawing_axes(ax) as axes:
-            for place, side in enumerate((self.a, self.b)):
-                p, low, high = (max(value, floor) for value in (side.p, *side.interval))
-                axes.errorbar([place], [p], yerr=[[p - low], [high - p]], fmt="o" if side.p > 0 else "v", capsize=4)
-            axes.set_yscale("log")
-            axes.set_xticks([0, 1], ["A", "B"])
-            axes.set_xlim(-0.5, 1.5)
-            axes.set_ylabel(f"P[f ≤ {self.either.gamma:g}]")
-            axes.set_title(self._ratio_text)
-        return axes
 
     def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
         """Return the simulated points behind both, as `Estimate.to_arrow` of `either`; f is the smaller outcome."""

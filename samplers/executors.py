@@ -359,7 +359,7 @@ class WorkerPool(Pool):
         running[task.call] = task
         if hasattr(task.job, "add_done_callback"):
             task.job.add_done_callback(lambda _, call=task.call: self._done.put((call, time.monotonic())))
-        else:
+        else:  # as of submitit
             threading.Thread(target=self._watch, args=(task.job, task.call), daemon=True).start()
 
     def _watch(self, job: Any, call: int) -> None:
@@ -422,11 +422,9 @@ class WorkerPool(Pool):
             raise ExecutorError(f"The executor does not answer any more ({describe(error)}).") from error
         except (Exception, CancelledError) as error:
             raise WorkerLost(describe_loss(error, ended - task.begun, self._limits[0])) from error
-        if not isinstance(reply, Reply):
-            words = f"Expected what the submitted function returns as result of a future, got {reprlib.repr(reply)}."
+        if not isinstance(reply, Reply) or reply.call != task.call:
+            words = f"Expected what the submitted call returns as result of its future, got {reprlib.repr(reply)}."
             raise ExecutorError(words)
-        if reply.call != task.call:
-            raise ExecutorError("A future of the executor has the result of another call.")
         if isinstance(reply.found, BaseException):
             raise reply.found
         self._proven = True
@@ -510,13 +508,6 @@ def _has_submit(executor: Any) -> bool:
 
 
 def _count_workers(pool: Any) -> int:
-    """Return the number of workers, as pools of several libraries tell it, or that of cores."""
-    for name in ("_max_workers", "num_workers"):
-        number = getattr(pool, name, None)
-        if isinstance(number, int) and number > 0:
-            return number
-    client = getattr(pool, "_client", None)  # of dask
-    if client is not None:
-        with suppress(Exception):
-            return max(1, int(sum(client.nthreads().values())))
-    return os.cpu_count() or 1
+    """Return the number of workers, as those of `concurrent.futures` and loky tell it, or that of cores."""
+    number = getattr(pool, "_max_workers", None)
+    return number if isinstance(number, int) and number > 0 else os.cpu_count() or 1

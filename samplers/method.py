@@ -89,8 +89,6 @@ class Outcome:
     base_draws: int = 0
     """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
     them. Of draws from a mixture, the expected number from its base component."""
-    wide_draws: tuple[tuple[float, int], ...] = ()
-    """(s, n) for n independent draws from N(0, s^2 I) in standard normal space, s > 1, made beside them."""
     no_outcome_share: float = 0.0
     """Share of p that comes from points without an outcome (f raised or gave NaN)."""
     counts: tuple[int, int] | None = None

@@ -242,7 +242,6 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=_merge_samples(used, shares),
         base_draws=sum(outcome.base_draws for outcome in used),
-        wide_draws=tuple(wide for outcome in used for wide in outcome.wide_draws),
         draw_weights=weights,
         chosen=_merge_choices(used),
     )

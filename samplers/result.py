@@ -44,7 +44,6 @@ from samplers.sample import (
     Sample,
     SimulatedPoints,
     Status,
-    corner_missed,
     describe_outcome,
 )
 
@@ -83,16 +82,6 @@ class Estimate(EstimateData, Kept):
         of f and chains may find far smaller regions, but guarantee nothing. A region may lie in several strata.
         """
         return self.bound_missed(self.confidence)
-
-    @property
-    def unseen_corner(self) -> float:
-        """The same for a region beyond up to three planes at right angles, which wide draws meet more often.
-
-        Of n draws from N(0, s^2 I) each meets the region of probability Phi(-b)^3 with probability Phi(-b / s)^3, in
-        the standard normal coordinates that are searched. It is `unseen` without wide draws.
-        """
-        drawn = ((1.0, self.base_draws), *self.wide_draws)
-        return corner_missed(drawn, self.confidence) if self.wide_draws else self.unseen
 
     def curve(self, gammas: ArrayLike) -> Curve:
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
@@ -245,11 +234,7 @@ class Estimate(EstimateData, Kept):
         """What is not in p and its interval: what the problem holds fixed, and failure regions that were missed."""
         fixed = f"given that {self.given}; " if self.given else ""
         by = f"({self.base_draws:,} base draws, {100 * self.confidence:g} % confidence)"
-        text = f"{fixed}a failure region that the search missed: below {self.unseen:.1e} {by}"
-        wide = sum(n for _, n in self.wide_draws)
-        if not wide:
-            return text
-        return f"{text}; a corner of planes at right angles: below {self.unseen_corner:.0e} ({wide:,} wide draws)"
+        return f"{fixed}a failure region that the search missed: below {self.unseen:.1e} {by}"
 
     def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.
@@ -399,7 +384,7 @@ class Estimate(EstimateData, Kept):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
-        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen unseen_corner given gain remarks seed"
+        plain = "p interval sequence confidence cov gamma n_sim base_draws unseen given gain remarks seed"
         plain += " base_uncertainty warnings choice closest trace failures"
         data = {name: getattr(self, name) for name in plain.split()} | {
             "text": str(self),

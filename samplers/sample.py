@@ -356,32 +356,11 @@ def bound_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> float
     return min(1.0, whole + float((w[reached] * missed).sum()))
 
 
-CORNER = 3
-"""Conditions that a failure takes at once, as fast, near and braking: half-spaces of a corner that may be missed."""
-FURTHEST = 1e4
-"""Distance in standard deviations that no wide draw comes near."""
-
-
 def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
     """Return p exp(-+ q s), p > 0, s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile; at most 1."""
     quantile = float(stdtrit(df, 0.5 + confidence / 2))
     half = min(quantile * math.sqrt(math.log1p(cov * cov)), 700.0)  # exp(709) is the largest number
     return p * math.exp(-half), min(1.0, p * math.exp(half))
-
-
-def corner_missed(drawn: Sequence[tuple[float, int]], confidence: float) -> float:
-    """Return the largest probability of a corner of CORNER half-spaces that all draws miss as `bound_missed` says.
-
-    It has the probability Phi(-b)^3 where they are at right angles and at the same distance b. `drawn` has (s, n) for n
-    draws from N(0, s^2 I), of which each meets it with probability Phi(-b / s)^3; fewer half-spaces, or others nearer,
-    of the same probability are met more often.
-    """
-    scales, n = (np.array(column, dtype=np.float64) for column in zip(*drawn, strict=True))
-
-    def excess(b: float) -> float:
-        return float(n @ np.log1p(-(ndtr(-b / scales) ** CORNER))) - math.log1p(-confidence)
-
-    return float(ndtr(-brentq(excess, 0.0, FURTHEST))) ** CORNER if excess(0.0) < 0 < excess(FURTHEST) else 1.0
 
 
 def confidence_sequence(p: float, interval: Interval, cov: float, target_cov: float, confidence: float) -> Interval:

@@ -11,15 +11,15 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_880,
-    "code lines": 36_780,
+    "package lines": 57_730,
+    "code lines": 36_700,
     "modules": 214,
-    "functions": 3_227,
-    "classes": 472,
+    "functions": 3_217,
+    "classes": 471,
     "import lines, percent of code": 10.4,
-    "test lines": 34_060,
+    "test lines": 33_970,
     "pages": 18,
-    "words of pages": 37_100,
+    "words of pages": 37_090,
     "files entered by an estimate": 43,
     "files entered by plain Monte Carlo": 20,
     "files entered by the command": 87,

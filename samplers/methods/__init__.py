@@ -1,13 +1,9 @@
-"""Methods by the names that the command line uses, those of other packages included; and the choice of one, `Auto`."""
+"""Methods by the names that the command line uses, and the choice of one, `Auto`."""
 
 import inspect
-import math
-import warnings
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from importlib.metadata import entry_points
 from pkgutil import resolve_name
+from types import MappingProxyType
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -25,7 +21,7 @@ from samplers.methods.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate import Surrogate, SurrogateRun
 from samplers.methods.two_stage.method import TwoStage
 from samplers.output import register_stored
-from samplers.problem import Inputs, check_name, check_settings
+from samplers.problem import Inputs, check_name
 from samplers.sample import Level, Sample, Status
 
 __all__ = [
@@ -51,8 +47,6 @@ rounds take what the search leaves: with 1,500 in 21 to 500 (16 limit states, 6 
 4 of their standard errors for 27, at half the mean square error; with 3,000 the variance was 8 times as large."""
 ENOUGH = 1000
 """Simulations from which `Series` has room for walks, rounds and an estimate."""
-SLOW = 1.0
-"""Seconds of a simulation from which on 6,000 of them are taken as too many if max_sim does not say: 100 minutes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,17 +63,13 @@ class Auto(Method):
          that is less), each that is safe predicted from the others. Else `AdaptiveSubsetSimulation` goes on from these.
 
        More simulations are for `TwoStage`, but up to 2,000 in more than 20 dimensions for `AdaptiveSubsetSimulation`.
-    3. *Cost.* Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, 1,000;
-       a target c.o.v. without max_sim goes to `TwoStage`.
+    3. Without max_sim a run has the 6,000 simulations of `TwoStage`, or those that a target c.o.v. takes.
 
     The budget is that of one replicate; coordinates that the base distribution calls noise are not searched, and do not
     count as dimensions. What decided between methods does not count in p, but for the draws from which subset
     simulation goes on: the safe ones decided, not how many fail. The result names the method, and `Estimate.choice`
     says why. In a sum over strata every run of a stratum chooses for itself, after a pilot of plain draws;
     `Part.method` names all.
-
-    Args:
-        seconds_per_simulation: Time that one simulation takes; None where it is not known.
 
     Example:
         >>> import samplers
@@ -90,21 +80,13 @@ class Auto(Method):
         two-stage: 3,000 simulations for 2 dimensions
     """
 
-    seconds_per_simulation: float | None = None
-
     name: ClassVar[str] = "auto"
     stops_at_target: ClassVar[bool] = True
     chooses: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if self.seconds_per_simulation is not None:
-            check_settings(self, seconds_per_simulation=(0.0, math.inf))
-
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Learn f if there are few simulations, and go on by the method that suits it."""
-        slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
-        budget = (FEW if slow else TwoStage().n) if goal.max_sim is None else goal.max_sim
+        budget = TwoStage().n if goal.max_sim is None else goal.max_sim
         noise, offer = noise_mask(inputs), offer_of(inputs)
         dim = inputs.dim - (0 if noise.all() else int(np.count_nonzero(noise)))
         size = f"{budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}"
@@ -131,61 +113,13 @@ class Auto(Method):
         return replace((yield from run.go_on(method.steps(*about))), chosen=choice)
 
 
-ENTRY_POINT_GROUP = "rare_envs.samplers"
-"""Entry points of this group name methods of other packages."""
-
-
-class Methods(Mapping[str, type[Stepping]]):
-    """Methods by name: our own, then those that installed packages offer.
-
-    A package offers a method by an entry point, here in its `pyproject.toml`:
-
-        [project.entry-points."rare_envs.samplers"]
-        lattice = "their_package:Lattice"
-
-    with the `name` of the class on the left. Other packages are imported when a name that is not ours, or the list of
-    all names, is first requested. An entry point that cannot be used is left out with a `RuntimeWarning` that names it.
-    """
-
-    def __init__(self, *own: type[Stepping]) -> None:
-        self._own = {method.name: method for method in own}
-        self.own = list(self._own)
-        """The names of our own methods."""
-
-    @cached_property
-    def _all(self) -> dict[str, type[Stepping]]:
-        """Our own and those of other packages by name."""
-        loaded = dict(self._own)
-        for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
-            name = entry.name
-            try:
-                if name in loaded:
-                    raise ValueError("that name is taken")
-                found = _check_class(entry.load())
-                if found.name != name:
-                    raise ValueError(f"the class {found.__name__} is named {found.name!r}, its entry point {name!r}")
-                loaded[name] = found
-            except Exception as error:  # an error of another package must not break this one
-                package = "" if entry.dist is None else f" of {entry.dist.name}"
-                what = f"The method {name!r}{package} ({entry.value}) cannot be used"
-                warnings.warn(f"{what}: {type(error).__name__}: {error}", RuntimeWarning, stacklevel=2)
-        return loaded
-
-    def __getitem__(self, name: str) -> type[Stepping]:
-        return self._own[name] if name in self._own else self._all[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._all)
-
-    def __len__(self) -> int:
-        return len(self._all)
-
-
-METHODS = Methods(
+_OWN: tuple[type[Stepping], ...] = (
     *(Auto, TwoStage, Series, Surrogate, MonteCarlo, ImportanceSampling, CrossEntropy, ImprovedCrossEntropy),
     *(SubsetSimulation, AdaptiveSubsetSimulation),
 )
-register_stored(*(METHODS[name] for name in METHODS.own))
+METHODS = MappingProxyType({method.name: method for method in _OWN})
+"""Methods by name; one of another package is named by its place, "module:Class"."""
+register_stored(*_OWN)
 
 
 def get_method(name: str, **settings: Any) -> Stepping:

@@ -249,12 +249,11 @@ class Jobs:
 
 
 def test_threads_and_jobs_give_the_bits_of_one_process() -> None:
-    expected = by(samplers.executors.InProcess())
+    assert by(FuturesPool(Jobs(), workers=2)) == by(samplers.executors.InProcess())
     with ThreadPoolExecutor(3) as threads:
-        assert by(threads) == expected
+        assert by(threads) == by(samplers.executors.InProcess())
         assert threads.submit(int, 7).result() == 7  # it is the caller's, and goes on
         exits = estimate(problem(FAULTS["exiting"]), FuturesPool(threads, time_limit=1e-9), 60)
-    assert by(FuturesPool(Jobs(), workers=2)) == expected
     assert "1 simulations gave no outcome" in " ".join(exits.warnings)
 
 
@@ -278,8 +277,8 @@ class Wrong:
     ("answer", "message"),
     [
         ("no future", "Expected Wrong.submit to return a future, got Reply"),
-        ("a number", "as result of a future, got 3"),
-        ("another call", "the result of another call"),
+        ("a number", "as result of its future, got 3"),
+        ("another call", "as result of its future, got Reply"),
     ],
 )
 def test_a_pool_that_answers_something_else_ends_the_run_in_one_line(answer: str, message: str) -> None:

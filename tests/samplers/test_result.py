@@ -14,7 +14,6 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib import pyplot
-from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
@@ -65,19 +64,8 @@ def test_says_how_large_a_region_may_have_been_missed():
     said = "a failure region that the search missed: below 3.0e-03 (1,000 base draws, 95 % confidence)"
     assert said == estimate.proviso and said in estimate.details()
     assert (1 - estimate_adss(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
-    assert estimate.to_dict()["unseen"] == estimate.unseen == estimate.unseen_corner
+    assert estimate.to_dict()["unseen"] == estimate.unseen
     assert replace(estimate, base_draws=0).unseen == 1
-
-
-def test_wide_draws_bound_a_corner_that_was_missed():
-    estimate = replace(estimate_adss(), base_draws=600, wide_draws=((2.0, 200), (3.0, 100)))
-    b = -stats.norm.ppf(estimate.unseen_corner ** (1 / 3))
-    missed = [(1 - stats.norm.cdf(-b / s) ** 3) ** n for s, n in ((1, 600), (2, 200), (3, 100))]
-    assert np.prod(missed) == pytest.approx(0.05)
-    corner = f"; a corner of planes at right angles: below {estimate.unseen_corner:.0e} (300 wide draws)"
-    assert estimate.proviso.endswith(corner)
-    assert estimate.to_dict()["unseen_corner"] == estimate.unseen_corner < 1e-2 * estimate.unseen
-    assert replace(estimate, wide_draws=((2.0, 3),), base_draws=0).unseen_corner == 1
 
 
 def test_without_a_failure_it_says_which_bound_has_which_level():

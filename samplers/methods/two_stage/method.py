@@ -309,7 +309,7 @@ class TwoStageRun(SearchRun):
                 remarks=(*before.remarks, *outcome.remarks),
             )
         drawn = self.base_draws + outcome.base_draws
-        return replace(whole, trace=trace + outcome.trace, base_draws=drawn, wide_draws=before.wide_draws)
+        return replace(whole, trace=trace + outcome.trace, base_draws=drawn)
 
     def _estimate(self) -> Steps:
         """Draw from the last proposal until the budget is used or the target is met.
@@ -417,5 +417,4 @@ class TwoStageRun(SearchRun):
     def _outcome(self, draws: Draws, cov: float, interval: Interval) -> Outcome:
         """Return what weighted draws say of p."""
         outcome = draws.outcome(self.goal, Status.CONVERGED, self.simulator.close_trace(), 1.0, self.base_draws)
-        wide = Sizes.within(self.budget).wide if len(self.base_f) else ()
-        return replace(outcome, cov=cov, interval=interval, wide_draws=wide)
+        return replace(outcome, cov=cov, interval=interval)
