@@ -15,7 +15,6 @@ if not is_command_line() or not find_missing_libraries():  # a command line show
 
     from rare_envs.registration import (
         env,
-        make_batch,
         parallel_env,
         register_envs,
         register_scenario,
@@ -43,7 +42,6 @@ __all__ = [
     "env",
     "highway_env_problem",
     "load_study",
-    "make_batch",
     "parallel_env",
     "register_scenario",
     "risk",

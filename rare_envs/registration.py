@@ -6,7 +6,6 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-from gymnasium.vector import VectorEnv
 
 from rare_envs.scenarios.registry import (
     HIGHWAY_ENV_LAYOUT,
@@ -110,27 +109,3 @@ def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
     from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
     return OrderEnforcingWrapper(parallel_to_aec_wrapper(parallel_env(env_id, **kwargs)))
-
-
-def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """Return the batched VectorEnv of an id: `gym.make_vec` with its vector entry point.
-
-    Args:
-        env_id: For example "rare_envs/CutIn-v0".
-        num_envs: Number of scenarios.
-        **kwargs: `autoreset_mode`, see `rare_envs.envs.vector.DrivingVectorEnv`, and keyword arguments of `gym.make`
-            for the id.
-
-    Returns:
-        The environment, autoreset mode SAME_STEP unless another one is named.
-
-    Example:
-        >>> import rare_envs
-        >>> batch = rare_envs.make_batch("rare_envs/CutIn-v0", num_envs=8)
-        >>> batch.reset(seed=0)[0].shape
-        (8, 11)
-
-    Raises:
-        ValueError: If the id or an argument is unknown.
-    """
-    return gym.make_vec(env_id_of(env_id), num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from rare_envs.distributions.product import ProductDistribution
 from rare_envs.distributions.stratified import StratifiedDistribution
+from rare_envs.scenarios.registry import env_id_of
 from rare_envs.simulation.observation import map_kinds
 
 Indices = int | Iterable[int] | None
@@ -56,13 +57,11 @@ def sb3_vec_env(
         >>> done.tolist()
         [False, False, False, False]
     """
-    import rare_envs
-
     ids = (id,) if isinstance(id, str) else tuple(id)
     if not ids or num_envs < len(ids):
         raise ValueError(f"Expected num_envs >= {max(len(ids), 1)}, got {num_envs}.")
     sizes = [num_envs // len(ids) + (number < num_envs % len(ids)) for number in range(len(ids))]
-    batches = [rare_envs.make_batch(each, size, **make_kwargs) for each, size in zip(ids, sizes, strict=True)]
+    batches = [gym.make_vec(env_id_of(each), size, **make_kwargs) for each, size in zip(ids, sizes, strict=True)]
     for batch in batches if even_strata else ():
         own: Any = batch.unwrapped
         own.space = replace(own.space, base=_even_out(own.space.base))

@@ -21,6 +21,7 @@ from types import MappingProxyType
 from typing import Annotated, Any
 from unittest import mock
 
+import gymnasium as gym
 import numpy as np
 import torch
 import typer
@@ -76,7 +77,7 @@ class Trained:
 
 def mean_return(ego: Any, env_id: str) -> float:
     """Return the mean return of the first episodes of a batch with seed 123, driven without exploration."""
-    env = rare_envs.make_batch(env_id, EPISODES, action="discrete" if ego.algorithm == "dqn" else "continuous")
+    env = gym.make_vec(env_id, EPISODES, action="discrete" if ego.algorithm == "dqn" else "continuous")
     total, running = np.zeros(EPISODES), np.ones(EPISODES, dtype=bool)
     observation, _ = env.reset(seed=123)
     while running.any():

@@ -31,7 +31,7 @@ def test_bad_values_and_types_are_refused_at_the_door() -> None:
             env.reset(options=options)  # type: ignore[arg-type]
     for num_envs in (2.5, "3", 0):
         with pytest.raises(ValueError, match="num_envs"):
-            rare_envs.make_batch("rare_envs/CutIn-v0", num_envs)  # type: ignore[arg-type]
+            gym.make_vec("rare_envs/CutIn-v0", num_envs)  # type: ignore[arg-type]
 
 
 def test_an_unknown_keyword_is_named_with_the_nearest_known_one() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3
@@ -229,7 +230,7 @@ def test_episodes_that_follow_begin_in_failures_too() -> None:
 
 
 def test_the_share_of_failures_is_drawn_and_the_rest_is_of_the_base() -> None:
-    space, failures = rare_envs.make_batch(ENV, 1).space, np.concatenate((FAILURE, FAILURE + 1.0))
+    space, failures = gym.make_vec(ENV, 1).space, np.concatenate((FAILURE, FAILURE + 1.0))
     x = Retraining(Path("ego.zip"), failures, 0.3).mix(space).base.sample(20_000, np.random.default_rng(0))
     first, second = ((x == row).all(axis=1) for row in failures)
     for drawn in (first, second):

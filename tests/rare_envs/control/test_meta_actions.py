@@ -194,6 +194,6 @@ def test_the_id_used_in_training_is_taken_everywhere() -> None:
     assert short.env_id == imported.env_id == "rare_envs/CutIn-v0"
     many = rare_envs.parallel_env("rare_envs/CutIn-kinematics-v0")
     assert many.action_space("ego") == gym.spaces.Discrete(5)
-    assert rare_envs.make_batch("rare_envs/CutIn-kinematics-v0", num_envs=2).single_observation_space.shape == (5, 5)
+    assert gym.make_vec("rare_envs/CutIn-kinematics-v0", num_envs=2).single_observation_space.shape == (5, 5)
     asked = Question(env_id="rare_envs/CutIn-kinematics-v0")
     assert asked == Question(env_id="rare_envs/CutIn-v0", observation="kinematics", action="meta")

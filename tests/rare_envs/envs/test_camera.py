@@ -34,7 +34,7 @@ class Daredevil:
 @ids
 def test_env_and_batch_see_the_same(env_id: str) -> None:
     settings: dict[str, Any] = {"observation": ("lidar", "camera"), "weather": True, "camera": SMALL}
-    env, batch = gym.make(env_id, **settings), rare_envs.make_batch(env_id, 3, **settings)
+    env, batch = gym.make(env_id, **settings), gym.make_vec(env_id, 3, **settings)
     _, infos = batch.reset(seed=4)
     seen, _ = batch.reset(options={"x": infos["x"]})
     rows = [env.reset(options={"x": x})[0] for x in infos["x"]]

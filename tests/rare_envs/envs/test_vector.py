@@ -23,7 +23,7 @@ def test_scenarios_are_those_of_one_draw_after_the_other(env_id: str, monkeypatc
     runs = []
     for in_a_row in (DRAWS_IN_A_ROW, ()):
         monkeypatch.setattr("rare_envs.envs.rows_and_infos.DRAWS_IN_A_ROW", in_a_row)
-        batch = rare_envs.make_batch(env_id, 4, horizon=0.5)
+        batch = gym.make_vec(env_id, 4, horizon=0.5)
         _, infos = batch.reset(seed=6)
         rows = [infos["x"]]
         for tick in range(12):
@@ -32,7 +32,7 @@ def test_scenarios_are_those_of_one_draw_after_the_other(env_id: str, monkeypatc
                 rows.append(batch.reset(options={batch.space.names[0]: given})[1]["x"])
             if tick == 9:
                 kept = batch.export_state()
-                batch = rare_envs.make_batch(env_id, 4, horizon=0.5)
+                batch = gym.make_vec(env_id, 4, horizon=0.5)
                 batch.reset(seed=1)
                 batch.restore_state(kept)
             rows.append(batch.step(np.zeros((4, 2), np.float32))[-1]["x"])
@@ -75,7 +75,7 @@ def test_episodes_after_a_replacement_are_those_of_the_single_env(env_id: str) -
 @scripted
 def test_episodes_replaced_in_the_next_step_are_those_of_the_single_env(env_id: str) -> None:
     """The step after an end starts an episode: its action does not count, its reward is 0, and nothing moves."""
-    batch = rare_envs.make_batch(env_id, 3, horizon=0.8, autoreset_mode="NextStep")
+    batch = gym.make_vec(env_id, 3, horizon=0.8, autoreset_mode="NextStep")
     env = gym.make(env_id, horizon=0.8)
     observation, infos = batch.reset(seed=5)
     rng = np.random.default_rng(0)
@@ -109,7 +109,7 @@ def test_episodes_replaced_in_the_next_step_are_those_of_the_single_env(env_id: 
 
 
 def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:
-    batch = rare_envs.make_batch("rare_envs/CutIn-v0", 3, horizon=0.2, autoreset_mode=gym.vector.AutoresetMode.DISABLED)
+    batch = gym.make_vec("rare_envs/CutIn-v0", 3, horizon=0.2, autoreset_mode=gym.vector.AutoresetMode.DISABLED)
     with pytest.raises(RuntimeError, match="of all episodes before one with reset_mask"):
         batch.reset(options={"reset_mask": np.array([True, False, False])})
     _, infos = batch.reset(seed=0)
@@ -133,7 +133,7 @@ def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:
 
 def test_each_seed_of_a_list_is_that_of_a_single_environment() -> None:
     """It draws what the single one draws, at the start and after an end, behind others too."""
-    batch, still = rare_envs.make_batch("rare_envs/CutIn-v0", 3, horizon=0.1), np.zeros((3, 2), np.float32)
+    batch, still = gym.make_vec("rare_envs/CutIn-v0", 3, horizon=0.1), np.zeros((3, 2), np.float32)
     singles, seeds = [gym.make("rare_envs/CutIn-v0") for _ in range(3)], [5, 5, 9]
     first = [env.reset(seed=seed)[1]["x"] for env, seed in zip(singles, seeds, strict=True)]
     np.testing.assert_array_equal(batch.reset(seed=seeds)[1]["x"], first)
@@ -152,18 +152,18 @@ def test_each_seed_of_a_list_is_that_of_a_single_environment() -> None:
 
 @pytest.mark.parametrize("mask", [np.zeros(2, bool), np.ones(3, bool), np.array([1, 0])])
 def test_a_wrong_mask_or_mode_is_refused(mask: np.ndarray) -> None:
-    batch = rare_envs.make_batch("rare_envs/CutIn-v0", 2)
+    batch = gym.make_vec("rare_envs/CutIn-v0", 2)
     batch.reset(seed=0)
     with pytest.raises(ValueError, match=r"reset_mask boolean of shape \(2,\)"):
         batch.reset(options={"reset_mask": mask})
     with pytest.raises(ValueError, match=r"autoreset_mode 'later'; expected one of 'NextStep', 'SameStep', 'Disabled'"):
-        rare_envs.make_batch("rare_envs/CutIn-v0", 2, autoreset_mode="later")
+        gym.make_vec("rare_envs/CutIn-v0", 2, autoreset_mode="later")
 
 
 def test_vehicles_that_begin_in_each_other_are_refused() -> None:
     """A cutter of 5 m whose rear is 10 m behind the ego's front has a lead whose rear is lead_gap - 5 m before it."""
     apart, touching = ({"cut_in_gap": -10.0, "lead_gap": gap} for gap in (5.1, 4.9))
-    batches = AgentsVectorEnv("rare_envs/CutIn-v1", 2), rare_envs.make_batch("rare_envs/CutIn-v1", 2)
+    batches = AgentsVectorEnv("rare_envs/CutIn-v1", 2), gym.make_vec("rare_envs/CutIn-v1", 2)
     for env in (gym.make("rare_envs/CutIn-v1"), rare_envs.parallel_env("rare_envs/CutIn-v1"), *batches):
         env.reset(seed=0, options=apart)
         with pytest.raises(ValueError, match="vehicles apart at the start, got the lead in the ego"):
@@ -205,7 +205,7 @@ WEIGHTS = {"speed": 1.0, "effort": -0.1, "lane": -0.5, "risk": -1.0, "headway": 
 @pytest.mark.parametrize("reward", [spare, WEIGHTS, f"{__name__}:spare"], ids=["function", "weights", "name"])
 @pytest.mark.parametrize("action", ["continuous", "meta"])
 def test_a_reward_of_ones_own_is_the_same_in_one_environment_and_in_a_batch(reward: Any, action: str) -> None:
-    batch = rare_envs.make_batch("rare_envs/CutIn-v0", 3, reward=reward, action=action)
+    batch = gym.make_vec("rare_envs/CutIn-v0", 3, reward=reward, action=action)
     batch.reset(seed=[0, 1, 2])
     single = gym.make("rare_envs/CutIn-v0", reward=reward, action=action)
     standard = gym.make("rare_envs/CutIn-v0", action=action)
@@ -238,5 +238,5 @@ def test_terms_have_the_names_of_highway_env_and_others_are_refused() -> None:
         (lambda step: step.speed[:1], r"^Expected a finite reward of shape \(2,\), a number, .* got array\("),
     ):
         with pytest.raises(ValueError, match=said) as refused:
-            rare_envs.make_batch("hard_brake", 4, reward=wrong)
+            gym.make_vec("rare_envs/HardBrake-v0", 4, reward=wrong)
         assert "\n" not in str(refused.value)

@@ -145,9 +145,6 @@ def test_actions_that_are_not_finite_are_reported_as_by_torch() -> None:
     x = problem.base.sample(5, np.random.default_rng(0))
     with pytest.raises(ValueError, match="nan"):
         problem.evaluate(x)
-    f, reasons = problem.attempt(x)
-    assert np.isnan(f).all()
-    assert set(reasons) == set(range(5))
 
 
 @pytest.mark.parametrize(("name", "value"), [("desired_speed", 0.0), ("time_headway", float("nan"))])

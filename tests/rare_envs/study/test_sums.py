@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import rare_envs
+import samplers.evaluate
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import BadInput, Question, prepare, run, run_into, writing
 from rare_envs.study.html_report import write_html_report
@@ -62,15 +63,15 @@ def test_a_risk_that_was_stopped_is_resumed_or_goes_on_with_the_same_command(
     """Stopped in the second scenario: nothing that was simulated is simulated again, and no journal is left."""
     monkeypatch.setattr(writing, "save_pictures", lambda path, report: None)
     monkeypatch.setattr(DrivingProblem, "tile", 30)
-    attempt, made, most = DrivingProblem.attempt, [0], [150]
+    simulate, made, most = samplers.evaluate._attempt, [0], [150]
 
-    def stopping(self: DrivingProblem, x: Any) -> Any:
-        if made[0] + len(x) > most[0]:
+    def stopping(problem: Any, gamma: float, chunk: Any) -> Any:
+        if made[0] + len(chunk) > most[0]:
             raise KeyboardInterrupt
-        made[0] += len(x)
-        return attempt(self, x)
+        made[0] += len(chunk)
+        return simulate(problem, gamma, chunk)
 
-    monkeypatch.setattr(DrivingProblem, "attempt", stopping)
+    monkeypatch.setattr(samplers.evaluate, "_attempt", stopping)
     bases = ("--base", f"hard_brake={brakings}", "--base", f"cut_in={write_fitted(tmp_path / 'cut.json', 'cut_in')}")
     words = ("risk", "idm", *bases, "--method", "mc", "--max-sim", "120", "--seed", "4", "--out")
     stopped = cli(*words, tmp_path / "run")

@@ -319,7 +319,7 @@ def test_a_folder_that_is_deleted_in_mid_run(
 ) -> None:
     words = (*SMALL[:-1], 600, "--base", risky, "--json", "--out")
     whole = cli(*words, "whole")
-    attempt, rows = DrivingProblem.attempt, [0]
+    simulate, rows = DrivingProblem.evaluate, [0]
 
     def deleting(self: DrivingProblem, x: Any) -> Any:
         rows[0] += len(x)
@@ -327,9 +327,9 @@ def test_a_folder_that_is_deleted_in_mid_run(
             shutil.rmtree("runs")
             if not back:
                 Path("runs").touch()  # a file where the folder was
-        return attempt(self, x)
+        return simulate(self, x)
 
-    monkeypatch.setattr(DrivingProblem, "attempt", deleting)
+    monkeypatch.setattr(DrivingProblem, "evaluate", deleting)
     ended = cli(*words, "runs/one")
     assert json.loads(ended.stdout)["p"] == json.loads(whole.stdout)["p"] > 0
     assert "Traceback" not in ended.stderr
@@ -344,7 +344,7 @@ def test_a_folder_that_is_deleted_in_mid_run(
 def test_an_ego_that_changes_the_working_directory(
     asked: Question, frail: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    elsewhere, before = frail / "elsewhere", DrivingProblem.attempt
+    elsewhere, before = frail / "elsewhere", DrivingProblem.evaluate
     elsewhere.mkdir()
 
     def moving(self: DrivingProblem, x: Any) -> Any:
@@ -352,7 +352,7 @@ def test_an_ego_that_changes_the_working_directory(
         return before(self, x)
 
     study = prepare(replace(asked, ego="idm", max_sim=400))
-    monkeypatch.setattr(DrivingProblem, "attempt", moving)
+    monkeypatch.setattr(DrivingProblem, "evaluate", moving)
     evaluate.run_into(RUN, study)
     assert names_in(frail / "run") == TABLES
     assert not list(elsewhere.iterdir())
