@@ -14,7 +14,6 @@ if not is_command_line() or not find_missing_libraries():  # a command line show
     require_libraries()  # before anything that needs them
 
     from rare_envs.registration import (
-        env,
         parallel_env,
         register_envs,
         register_scenario,
@@ -39,7 +38,6 @@ __all__ = [
     "DrivingProblem",
     "HighwayEnvScenario",
     "ScenarioSpace",
-    "env",
     "highway_env_problem",
     "load_study",
     "parallel_env",

@@ -83,30 +83,6 @@ class HumanBenchmark:
         return {**asdict(self), **rates}
 
 
-def _count_100car(kind: str, count: int, how: str) -> HumanBenchmark:
-    """Return a count of the 100-Car study; all of its roads, since its exposure by type of road is not known."""
-    return HumanBenchmark(
-        study="100-Car",
-        kind=kind,
-        count=count,
-        miles=2_000_000.0,
-        source="Virginia Tech Transportation Institute, Researcher Dictionary for Video Reduction Data 1.3, page 4",
-        words=f'"approximately 2,000,000 vehicles miles"; {how}, counted in the published table of 828 events',
-    )
-
-
-def _count_shrp2(kind: str, count: int) -> HumanBenchmark:
-    return HumanBenchmark(
-        study="SHRP 2",
-        kind=kind,
-        count=count,
-        miles=34.5e6,
-        source="Kidd and McCartt 2015 (crashes); Ali, dissertation, Virginia Tech, 2023 (miles)",
-        words="\"Of 1,465 crashes ... 248 were severe ...; 597 were 'minor;' and 620 were 'low-risk tire strikes'\"; "
-        '"34.5 million miles"; the two from different papers',
-    )
-
-
 Event: TypeAlias = Literal["cut_in", "stop", "slowing"]
 """Another's lane change; a lead that brakes to a standstill; a lead that brakes without one."""
 Outcome: TypeAlias = Literal["contacts", "near_crashes"]
@@ -126,42 +102,17 @@ class PeopleInEvent(NamedTuple):
     near_crashes: HumanBenchmark
 
 
-_STOPPED = (
-    'rear-end, striking; precipitating event "other vehicle ahead - slowed and stopped 2 seconds or less" or '
-    '"stopped on roadway more than 2 seconds"'
-)
-_DECELERATING = 'rear-end, striking; precipitating event "other vehicle ahead - but decelerating"'
-_CUT_IN = "begun by another's lane change"
-_PEOPLE: dict[str, PeopleInEvent] = {
-    "cut_in": PeopleInEvent(
-        _count_100car(f"contacts {_CUT_IN}", 1, "1 crash, rear-end"),
-        _count_100car(f"near-crashes {_CUT_IN}", 136, "136 near-crashes: 74 rear-end, 58 sideswipe, 4 others"),
-    ),
-    "stop": PeopleInEvent(
-        _count_100car("contacts with a lead that stopped", 13, f"{_STOPPED}: 6 + 7 crashes"),
-        _count_100car("near-crashes with a lead that stopped", 132, f"{_STOPPED}: 101 + 31"),
-    ),
-    "slowing": PeopleInEvent(
-        _count_100car("contacts with a lead that slowed", 0, f"{_DECELERATING}: no crash"),
-        _count_100car("near-crashes with a lead that slowed", 152, f"{_DECELERATING}: 152"),
-    ),
-}
-CONTACTS_100CAR = _count_100car("contacts of all kinds", 68, "68 crashes, every contact")
-UNSEEN_CHANGES_100CAR = _count_100car(
-    "near-crashes in own lane changes into a vehicle that was not seen",
-    44,
-    '44 of the 74 near-crashes and 2 crashes in own lane changes: "did not see other vehicle during lane change"',
-)
-HUMAN_BENCHMARKS = (
-    CONTACTS_100CAR,
-    _count_100car("contacts into a vehicle ahead", 14, "rear-end, striking: 14 crashes"),
-    _count_100car("near-crashes", 760, "760 near-crashes"),
-    _count_100car("near-crashes with a vehicle ahead", 385, "rear-end, striking: 385"),
-    *(count for people in _PEOPLE.values() for count in people),
-    UNSEEN_CHANGES_100CAR,
-    _count_shrp2("crashes without tyre strikes", 248 + 597),
-    _count_shrp2("severe crashes", 248),
-)
+def _read_counts() -> dict[str, HumanBenchmark]:
+    """Return what was counted, by name; in the 100-Car study on all roads, since its exposure by type is not known."""
+    text = (resources.files("rare_envs") / "data" / "human_counts.json").read_text("utf-8")
+    found = json.loads(text)
+    return {name: HumanBenchmark(**found["studies"][each.pop("of")], **each) for name, each in found["counts"].items()}
+
+
+_COUNTS = _read_counts()
+CONTACTS_100CAR = _COUNTS["contacts"]
+UNSEEN_CHANGES_100CAR = _COUNTS["near_crashes of own changes unseen"]
+HUMAN_BENCHMARKS = tuple(_COUNTS.values())
 """All of them."""
 
 
@@ -177,7 +128,7 @@ def people_in(event: Event) -> PeopleInEvent:
         >>> people_in("stop").contacts.count, people_in("stop").near_crashes.count
         (13, 132)
     """
-    return _PEOPLE[event]
+    return PeopleInEvent(_COUNTS[f"{event} contacts"], _COUNTS[f"{event} near_crashes"])
 
 
 CALIBRATED_WITHIN = 3.0

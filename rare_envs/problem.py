@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -178,10 +177,6 @@ class DrivingProblem:
         measure = self.world.measurement.measure
         name = measure if isinstance(measure, str) else getattr(measure, "__name__", type(measure).__name__)  # a user's
         return f"<DrivingProblem {self.env_id}, ego {ego}, measure {name}, {self.dim} dimensions>"
-
-    def _repr_html_(self) -> str:
-        """Return the question and its parameters for notebooks."""
-        return f"<p>{escape(repr(self)[1:-1])}</p>{self.space._repr_html_()}"
 
     @property
     def core(self) -> str:

@@ -16,8 +16,6 @@ from rare_envs.scenarios.registry import (
 )
 
 if TYPE_CHECKING:
-    from pettingzoo import AECEnv
-
     from rare_envs.envs.parallel import DrivingParallelEnv
     from rare_envs.scenarios.base import Scenario
 
@@ -90,22 +88,3 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
 
     env_id, layout = split_layout(env_id_of(env_id))
     return DrivingParallelEnv(env_id, **{**layout, **kwargs})
-
-
-def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
-    """Return PettingZoo's AEC environment of an id: `parallel_env` with one agent acting after the other.
-
-    Its arguments are those of `parallel_env`, and so are its errors. PettingZoo's usual wrapper refuses calls in a
-    wrong order.
-
-    Example:
-        >>> import rare_envs
-        >>> game = rare_envs.env("rare_envs/CutIn-v0")
-        >>> game.reset(seed=0)
-        >>> game.agent_selection, game.state_space.shape
-        ('ego', (3, 4))
-    """
-    from pettingzoo.utils import OrderEnforcingWrapper
-    from pettingzoo.utils.conversions import parallel_to_aec_wrapper
-
-    return OrderEnforcingWrapper(parallel_to_aec_wrapper(parallel_env(env_id, **kwargs)))

@@ -11,13 +11,13 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_420,
-    "code lines": 36_480,
+    "package lines": 57_275,
+    "code lines": 36_375,
     "modules": 213,
-    "functions": 3_202,
+    "functions": 3_200,
     "classes": 471,
     "import lines, percent of code": 10.5,
-    "test lines": 33_870,
+    "test lines": 33_775,
     "pages": 18,
     "words of pages": 37_050,
     "files entered by an estimate": 43,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -203,16 +202,6 @@ class ScenarioSpace:
         n = len(self.names)
         names = ", ".join(self.names[:MOST_SHOWN]) + (", ..." if n > MOST_SHOWN else "")
         return f"<ScenarioSpace of {n} parameters in {self.dim} dimensions: {names}>"
-
-    def _repr_html_(self) -> str:
-        """Return a table of the parameters for notebooks."""
-        rows = "".join(
-            f"<tr><th>{escape(p.name)}</th><td>{p.low:g} to {p.high:g}</td>"
-            f"<td>{escape(p.unit)}</td><td>{p.size}</td></tr>"
-            for p in self.parameters
-        )
-        header = "<tr><th>parameter</th><th>range</th><th>unit</th><th>values</th></tr>"
-        return f"<table>{header}{rows}</table>"
 
     def validate(self, x: ArrayLike) -> FloatArray:
         """Check shape and ranges.
