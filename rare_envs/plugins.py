@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import difflib
+import dis
 import importlib
 import inspect
 import os
 import re
+import signal
 import sys
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.machinery import PathFinder
-from types import ModuleType
+from types import ModuleType, TracebackType
 from typing import Any, ClassVar, NoReturn
 
 _ODD, _JOINERS = re.compile(r"[^\n -~]"), "\u200c\u200d"
@@ -150,18 +152,20 @@ class CodeEnded(ValueError):
 
 @contextmanager
 def as_errors() -> Iterator[None]:
-    """Let whatever somebody's code raises in a block be an `Exception`, SystemExit included.
+    """Let whatever somebody's code raises in a block be an `Exception`, SystemExit and KeyboardInterrupt included.
 
-    Not `EgoGone`, and not KeyboardInterrupt, by which the user ends the run, nor what is raised because of it.
+    Not `EgoGone`, and not the KeyboardInterrupt of a signal, by which the user ends the run.
     """
     try:
         yield
-    except (Exception, EgoGone, KeyboardInterrupt):
+    except (Exception, EgoGone):
         raise
     except BaseException as error:
-        if any(isinstance(each, KeyboardInterrupt) for each in _list_causes(error)):
-            raise KeyboardInterrupt from error
-        raise CodeEnded(repr(error)) from error
+        if not any(map(_is_of_signal, _list_causes(error))):
+            raise CodeEnded(repr(error)) from error
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise KeyboardInterrupt from error
 
 
 def _list_causes(error: BaseException) -> list[BaseException]:
@@ -170,6 +174,23 @@ def _list_causes(error: BaseException) -> list[BaseException]:
     for each in found:  # which grows
         found += [one for one in (each.__cause__, each.__context__) if one is not None and one not in found]
     return found
+
+
+def _is_of_signal(error: BaseException) -> bool:
+    """Return whether it is a KeyboardInterrupt that no statement raised, but for one in a signal's handler."""
+    if not isinstance(error, KeyboardInterrupt) or error.__traceback__ is None:
+        return False
+    handlers = [getattr(signal.getsignal(number), "__code__", None) for number in signal.valid_signals()]
+    last, *others = [(trace.tb_frame.f_code, trace.tb_lasti) for trace in _walk(error.__traceback__)][::-1]
+    in_handler = any(code in handlers for code, _ in (last, *others))
+    return in_handler or last[0].co_code[last[1]] != dis.opmap["RAISE_VARARGS"]
+
+
+def _walk(trace: TracebackType | None) -> Iterator[TracebackType]:
+    """Yield the parts of a traceback, the innermost last."""
+    while trace is not None:
+        yield trace
+        trace = trace.tb_next
 
 
 class EgoGone(BaseException):

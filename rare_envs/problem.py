@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -238,14 +238,20 @@ class DrivingProblem:
             ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy or the measure
                 returns NaN.
         """
-        x = self.space.validate(np.atleast_2d(x))
-        f = self._simulate_compiled(x)
-        if f is None:
-            f = self._simulate_by_torch(x)
-        elif self.needs.queries_policy and (rows := np.flatnonzero(np.isnan(f))).size:  # torch tells what fails there
-            f[rows] = self._simulate_by_torch(x[rows])
-        self._check_known(x, f)
-        return f
+        return self._simulate(x, None)
+
+    def attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
+        """Simulate, and go on with the other rows when the policy fails on some.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+
+        Returns:
+            Safety measures, shape (n,), NaN in rows on which it fails, and the reasons by row. An error of a policy
+            with a memory is raised: it may be the fault of any row.
+        """
+        failed_rows: dict[int, str] = {}
+        return self._simulate(x, failed_rows), failed_rows
 
     def terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> EpisodeTerms:
         """Simulate, and tell apart the terms of which f is the least, one of each vehicle say.
@@ -267,10 +273,15 @@ class DrivingProblem:
             >>> terms.names[terms.least[0]], terms.lowest.round(1).tolist(), terms.f.round(1).tolist()  # [m] and [s]
             ('cutter, 0 to 45 % of the time', [6.6], [1.7])
         """
-        x = self.space.validate(np.atleast_2d(x))
-        terms = simulate_terms(self.world, gamma, partial(self._roll_out, x=x))
-        self._check_known(x, terms.f)
-        return terms
+        return self._simulate_terms(x, gamma, None)
+
+    def attempt_terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> tuple[EpisodeTerms, dict[int, str]]:
+        """Simulate as `terms` does, and go on as `attempt` does; f and terms are NaN in rows on which it fails."""
+        failed_rows: dict[int, str] = {}
+        terms = self._simulate_terms(x, gamma, failed_rows)
+        rows = list(failed_rows)
+        terms.f[rows], terms.values[rows] = np.nan, np.nan
+        return terms, failed_rows
 
     @cached_property
     def gradient(self) -> Differentiator | None:
@@ -305,7 +316,7 @@ class DrivingProblem:
         if not len(x):
             none, pairs = torch.empty(0), torch.empty(0, 2)
             return Crash(none.long(), pairs.long(), none, none, pairs, pairs)
-        parts = [end.statistics.crash for end in self._roll_out(world, x) if end.statistics is not None]
+        parts = [end.statistics.crash for end in self._roll_out(world, x, None) if end.statistics is not None]
         return Crash(*(torch.cat(values).cpu() for values in zip(*parts, strict=True)))
 
     def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
@@ -328,6 +339,21 @@ class DrivingProblem:
         usual = POLICY_CHUNK if isinstance(self.driver, PolicyDriver) else RULE_CHUNK
         return min(self.tile, usual) if self._chunk_size is None else self._chunk_size
 
+    def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
+        """Return f of scenarios x (n, d); NaN in `failed_rows`, which takes the reasons, unless it is None."""
+        x = self.space.validate(np.atleast_2d(x))
+        f = self._simulate_compiled(x)
+        if f is None:
+            f = self._simulate_by_torch(x, failed_rows)
+        elif self.needs.queries_policy and np.isnan(f).any():  # torch tells what fails there, and how
+            rows, failed = np.flatnonzero(np.isnan(f)), None if failed_rows is None else dict[int, str]()
+            f[rows] = self._simulate_by_torch(x[rows], failed)
+            if failed_rows is not None and failed is not None:
+                failed_rows.update({int(rows[row]): reason for row, reason in failed.items()})
+        self._check_known(x, f, failed_rows)
+        f[list(failed_rows or ())] = np.nan
+        return f
+
     def _simulate_compiled(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return f of scenarios x (n, d), NaN where it is not known; None if torch has to simulate."""
         if self._core == "torch":
@@ -341,28 +367,48 @@ class DrivingProblem:
             self._core = "torch" if isinstance(reason, CompilerFails) else self._core
             return None
 
-    def _simulate_by_torch(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.concatenate([np.empty(0), *(end.f.numpy(force=True) for end in self._roll_out(self.world, x))])
+    def _simulate_by_torch(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
+        parts = [end.f.numpy(force=True) for end in self._roll_out(self.world, x, failed_rows)]
+        return np.concatenate([np.empty(0), *parts])
 
-    def _roll_out(self, world: World, x: NDArray[np.float64]) -> Iterator[Episode]:
-        """Yield the episodes of x (n, d) at the horizon by tiles."""
+    def _simulate_terms(self, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None) -> EpisodeTerms:
+        x = self.space.validate(np.atleast_2d(x))
+        terms = simulate_terms(self.world, gamma, lambda world: self._roll_out(world, x, failed_rows))
+        self._check_known(x, terms.f, failed_rows)
+        return terms
+
+    def _roll_out(self, world: World, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> Iterator[Episode]:
+        """Yield the episodes of x (n, d) at the horizon by tiles; `failed_rows` takes reasons, None raises them."""
         for first in range(0, len(x), self.tile):
             rows = torch.from_numpy(x[first : first + self.tile]).float().to(self.device)
-            yield self.settle(self._drive(world, rows), rows)
+            mine = None if failed_rows is None else dict[int, str]()
+            end = self.settle(self._drive(world, rows, mine), rows, mine)
+            if failed_rows is not None and mine is not None:
+                failed_rows.update({first + row: reason for row, reason in mine.items()})
+            yield end
 
-    def _drive(self, world: World, rows: Tensor) -> Episode:
-        """Return the episodes of x (B, d), a tile, at the horizon."""
+    def _drive(self, world: World, rows: Tensor, failed_rows: dict[int, str] | None) -> Episode:
+        """Return the episodes of x (B, d), a tile, at the horizon; `failed_rows` as in `_roll_out`."""
+        driver = self.driver
+        if failed_rows is not None and isinstance(driver, PolicyDriver):
+            driver = replace(driver, failed_rows=failed_rows)
         with torch.inference_mode():
             end = None if self.device.type == "cpu" else self._replay(world, rows)
-            return rollout(world, self.driver, rows) if end is None else end
+            return rollout(world, driver, rows) if end is None else end
 
-    def settle(self, end: Episode, rows: Tensor) -> Episode:
+    def settle(self, end: Episode, rows: Tensor, failed_rows: dict[int, str] | None = None) -> Episode:
         """Return episodes at the horizon, of x (B, d), with what their measure takes from second rollouts, if any."""
         measure = end.measure
-        if not isinstance(measure, NearCrash) or not len(at := measure.find_undecided(end.measure_state)):
+        if not isinstance(measure, NearCrash):
             return end
+        at = measure.find_undecided(end.measure_state)
+        if not len(at):
+            return end
+        mine = None if failed_rows is None else dict[int, str]()
         ttc = Measurement("ttc", self.world.measurement.collisions)
-        again = self._drive(replace(self.world, rapid=False, measurement=ttc), rows[at.to(rows.device)])
+        again = self._drive(replace(self.world, rapid=False, measurement=ttc), rows[at.to(rows.device)], mine)
+        if failed_rows is not None and mine is not None:
+            failed_rows.update({int(at[row]): reason for row, reason in mine.items()})
         return end._replace(measure_state=measure.settle(end.measure_state, at, again.f.to(at.device)))
 
     def _replay(self, world: World, rows: Tensor) -> Episode | None:
@@ -386,14 +432,14 @@ class DrivingProblem:
         unknown = torch.stack([end.f.isnan(), *(values[:, 0].isnan() for values in end.state[:4])])
         return None if bool(unknown.any()) else end
 
-    def _check_known(self, x: NDArray[np.float64], f: NDArray[np.float64]) -> None:
-        """Raise a ValueError where f is NaN."""
-        unknown = np.flatnonzero(np.isnan(f))
-        if len(unknown):
-            row = unknown[0]
-            named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
-            measure = self.world.measurement.measure
-            raise ValueError(f"The measure {measure!r} gave NaN, first at row {row}: {named}.")
+    def _check_known(self, x: NDArray[np.float64], f: NDArray[np.float64], failed_rows: dict[int, str] | None) -> None:
+        """Raise a ValueError where f is NaN, or add the row to those that failed."""
+        for row in np.flatnonzero(np.isnan(f)):
+            if failed_rows is None:
+                named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
+                measure = self.world.measurement.measure
+                raise ValueError(f"The measure {measure!r} gave NaN, first at row {row}: {named}.")
+            failed_rows.setdefault(int(row), "the measure gave NaN")
 
 
 @contextmanager

@@ -142,8 +142,9 @@ def reason_of(error: BaseException) -> str:
 class Work:
     """Computes a chunk, here or in a worker, by `evaluate`, `terms` or `gradient` of a problem.
 
-    A row that fails ends the run where on_error is "raise"; else its f and terms are NaN. `name` is that of f in
-    messages. With a seed, what simulations draw follows from it and the index of
+    A problem that goes on by itself with the rows on which it does not fail has `attempt(x)` and `attempt_terms(x,
+    gamma)`, which also give the reasons by row. A row that fails ends the run where on_error is "raise"; else its f and
+    terms are NaN. `name` is that of f in messages. With a seed, what simulations draw follows from it and the index of
     their chunk (`seed_generators`).
     """
 
@@ -189,14 +190,18 @@ class Work:
 def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
     """Return what a problem gives for a chunk, with the reasons by row where it gives nothing; it may write on x."""
     x, *about = (array.copy() for array in chunk.arrays)
-    n, notes = len(x), dict[str, Any]()
+    n, notes, reasons = len(x), dict[str, Any](), dict[int, str]()
     if chunk.kind == "gradient":
         found = problem.gradient(x, *about, gamma)
         table = read_numbers(found.values, f"gradients of shape {x.shape}")
         if table.shape != x.shape:
             raise EvaluationError(f"Expected gradients of shape {x.shape}, got {table.shape}.")
         return Result(table, {"cost": float(found.cost), "reasons": {}})
-    found = problem.terms(x, gamma) if chunk.kind == "terms" else problem.evaluate(x)
+    whole, by_row, more = ("terms", "attempt_terms", (gamma,)) if chunk.kind == "terms" else ("evaluate", "attempt", ())
+    if _have_same_owner(problem, whole, by_row):
+        found, reasons = getattr(problem, by_row)(x, *more)  # foreign methods, by name
+    else:
+        found = getattr(problem, whole)(x, *more)
     if chunk.kind == "f":
         f = one_per_row(found, n)
         table = f[:, None]
@@ -208,7 +213,20 @@ def _attempt(problem: Any, gamma: float, chunk: Request) -> Result:
         f = np.where(np.isnan(values).any(axis=1), np.nan, f)
         table = np.column_stack((f, values, ticks))
         notes = {"threshold": float(found.threshold), "names": list(getattr(found, "names", ()))}
-    return Result(table, {**notes, "reasons": dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN")})
+    reasons = dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN") | reasons
+    return Result(table, {**notes, "reasons": reasons})
+
+
+def _have_same_owner(problem: Any, whole: str, by_row: str) -> bool:
+    """Return whether the method that goes on with the other rows computes what the method `whole` does.
+
+    A subclass, a wrapper or an instance that has `whole` of its own is asked by that.
+    """
+    owner = getattr(getattr(problem, by_row, None), "__self__", None)
+    if owner is None or getattr(getattr(problem, whole, None), "__self__", None) is not owner:
+        return False
+    definition = next(vars(kind) for kind in type(owner).__mro__ if {whole, by_row} & set(vars(kind)))
+    return {whole, by_row} <= set(definition)
 
 
 @contextmanager

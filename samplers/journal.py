@@ -13,12 +13,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
 import json
 import os
 import sqlite3
 import stat
 import time
 import warnings
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -57,8 +59,13 @@ class JournalInUse(JournalError):
     """Another process has the journal open."""
 
 
-def _damaged(path: Path, why: str) -> JournalError:
-    return JournalError(f"{str(path)!r} is damaged ({why}): remove it to start again.")
+class _Damaged(JournalError):
+    """A record does not match its digest."""
+
+    def __init__(self, path: Path, number: int = HEAD) -> None:
+        self.number = number
+        where = f": record {number + 1} does" if number > HEAD else " from its first record on, which does"
+        super().__init__(f"{str(path)!r} is damaged{where} not match its checksum.")
 
 
 class _Row(NamedTuple):
@@ -116,11 +123,7 @@ class Journal:
         _make(path)
         connection = _connect(path)
         try:
-            row = _Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")
-            for statement in ("BEGIN", f"PRAGMA application_id = {FORMAT}", TABLE):
-                connection.execute(statement)
-            connection.execute(INSERT, (*row, row.digest))
-            connection.execute("COMMIT")
+            _fill(connection, [_Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")])
             connection.execute("PRAGMA wal_checkpoint")
         except sqlite3.Error as error:
             connection.close()
@@ -128,21 +131,39 @@ class Journal:
         return cls(path, connection, head)
 
     @classmethod
-    def open(cls, path: Path) -> Journal:
-        """Continue a journal, all of whose digests are verified; NothingRecorded if it was cut before its first."""
+    def open(cls, path: Path, mend: bool = False) -> Journal:
+        """Continue a journal, all of whose digests are verified.
+
+        Of a damaged one, `mend` keeps what stands before the damage; if that is its first record it is left as it is.
+        Raises NothingRecorded for one that was cut before its first record.
+        """
         _check_own(path)
-        with path.open("rb") as file:
-            cut = len(header := file.read(HEADER_SIZE)) < HEADER_SIZE and MAGIC.startswith(header[: len(MAGIC)])
-        if cut and not path.with_name(f"{path.name}-wal").exists():
-            raise NothingRecorded(f"{str(path)!r} was cut at its beginning; nothing is recorded in it.")
-        connection = _connect(path)
+        missing = _count_missing(path)
         try:
-            return cls(path, connection, _verify(path, connection))
-        except BaseException as error:
-            connection.close()
-            if isinstance(error, sqlite3.DatabaseError):
-                raise _damaged(path, str(error)) from error
-            raise
+            if missing and mend:  # zeros, which no record consists of
+                os.truncate(path, os.stat(path).st_size + missing)
+            elif missing and not _wal(path).exists():  # where the end is if it was being copied from there
+                raise _Damaged(path)
+            connection = _connect(path)
+            try:
+                return cls(path, connection, _verify(path, connection))
+            except BaseException as error:
+                connection.close()
+                if isinstance(error, sqlite3.DatabaseError):
+                    raise _Damaged(path) from error
+                raise
+        except _Damaged as damage:
+            if missing and not mend:
+                raise JournalError(f"{str(path)!r} is damaged: its end is missing.") from damage
+            if not (mend and damage.number > HEAD):
+                raise
+            new = path.with_name(f"{path.name}.mended")
+            _make(new)
+            with contextlib.closing(_connect(path)) as damaged, contextlib.closing(_connect(new)) as mended:
+                _fill(mended, itertools.islice(_good_rows(path, damaged), damage.number))
+            _wal(path).unlink(missing_ok=True)
+            os.replace(new, path)
+            return cls.open(path)
 
     @property
     def n(self) -> int:
@@ -254,9 +275,30 @@ def _connect(path: Path) -> sqlite3.Connection:
     except sqlite3.DatabaseError as error:
         connection.close()
         if "malformed" in str(error):
-            raise _damaged(path, str(error)) from error
+            raise _Damaged(path) from error
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to start again.") from error
     return connection
+
+
+def _fill(connection: sqlite3.Connection, rows: Iterable[_Row]) -> None:
+    """Write the table of a new journal and records, all or nothing."""
+    for statement in ("BEGIN", f"PRAGMA application_id = {FORMAT}", TABLE):
+        connection.execute(statement)
+    connection.executemany(INSERT, ((*row, row.digest) for row in rows))
+    connection.execute("COMMIT")
+
+
+def _count_missing(path: Path) -> int:
+    """Return how many bytes are missing at the end of a file by its header."""
+    found = os.stat(path)
+    with path.open("rb") as file:
+        header = file.read(HEADER_SIZE)
+    if len(header) < HEADER_SIZE and MAGIC.startswith(header[: len(MAGIC)]) and not _wal(path).exists():
+        raise NothingRecorded(f"{str(path)!r} was cut at its beginning; nothing is recorded in it.")
+    if len(header) < HEADER_SIZE or not header.startswith(MAGIC):
+        return 0
+    page_size, n_pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+    return max(min(page_size * n_pages, 2**30 + found.st_size) - found.st_size, 0)  # a header may be damaged too
 
 
 def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
@@ -267,18 +309,28 @@ def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
     # a view in the table's place may have rows without end, and triggers change what is written
     if connection.execute("PRAGMA application_id").fetchone()[0] != FORMAT or schema != [TABLE]:
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to start again.")
-    head, number = None, HEAD
-    for *fields, digest in connection.execute(f"SELECT {COLUMNS}, digest FROM chunks ORDER BY id"):
-        row = _Row(*fields)
-        if row.id != number or not isinstance(row.numbers, bytes) or row.digest != digest:
-            raise _damaged(path, f"record {number + 1} does not match its checksum")
-        if number == HEAD:
-            with contextlib.suppress(ValueError, RecursionError):
-                head = json.loads(row.notes)
-        number += 1
+    notes, head = [row.notes for row in _good_rows(path, connection) if row.id == HEAD], None
+    with contextlib.suppress(ValueError, RecursionError):
+        head = json.loads(notes[0])
     if not isinstance(head, dict):
         raise JournalError(f"{str(path)!r} is no journal: its head is no object.")
     return head
+
+
+def _good_rows(path: Path, connection: sqlite3.Connection) -> Iterator[_Row]:
+    """Yield the records in their order; raise `_Damaged` at one that is."""
+    number = HEAD
+    try:
+        for *fields, digest in connection.execute(f"SELECT {COLUMNS}, digest FROM chunks ORDER BY id"):
+            row = _Row(*fields)
+            if row.id != number or not isinstance(row.numbers, bytes) or row.digest != digest:
+                raise _Damaged(path, number)
+            yield row
+            number += 1
+    except sqlite3.DatabaseError as error:
+        raise _Damaged(path, number) from error
+    if number == HEAD:
+        raise _Damaged(path)
 
 
 def _list_files(path: Path) -> list[Path]:
@@ -308,3 +360,8 @@ def _check_own(path: Path) -> None:
                     f"{str(name)!r} is no ordinary file, or has another name too, which would be written to as well: "
                     "put a copy in its place."
                 )
+
+
+def _wal(path: Path) -> Path:
+    """Return the file that SQLite keeps beside a database for what is not yet in it."""
+    return path.with_name(f"{path.name}-wal")

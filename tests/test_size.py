@@ -11,15 +11,15 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_275,
-    "code lines": 36_375,
+    "package lines": 57_570,
+    "code lines": 36_580,
     "modules": 213,
-    "functions": 3_200,
-    "classes": 471,
+    "functions": 3_214,
+    "classes": 473,
     "import lines, percent of code": 10.5,
-    "test lines": 33_775,
+    "test lines": 33_970,
     "pages": 18,
-    "words of pages": 37_050,
+    "words of pages": 37_070,
     "files entered by an estimate": 43,
     "files entered by plain Monte Carlo": 20,
     "files entered by the command": 87,

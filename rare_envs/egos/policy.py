@@ -1,7 +1,8 @@
-"""Policies as drivers: the check of their spaces, and queries of whole batches."""
+"""Policies as drivers: the check of their spaces, queries of whole batches, and the rows on which they fail."""
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from rare_envs.egos.needs import (
     wrap_callable,
 )
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
-from rare_envs.plugins import NoAnswer, as_errors, check_name, is_policy, refuse_ego
+from rare_envs.plugins import NoAnswer, as_errors, check_name, is_policy, reason_of, refuse_ego
 from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.observation import map_kinds, observation_space, observe
 from rare_envs.simulation.world import Driver, TrafficPolicy, World
@@ -52,22 +53,27 @@ class PolicyDriver:
     """What its actions are."""
     stride: int = 1
     """Ticks from one query to the next; in between meta-actions go on."""
+    failed_rows: dict[int, str] | None = None
+    """Takes the rows on which the policy fails, with the reason; None if such a failure is raised."""
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Observe, and query the policy for its mean action; a recurrent policy's hidden state is the memory.
 
         No episode shows a policy what comes after its collision, so those rows are shown what another row sees, and
-        their actions are ignored.
+        their actions are ignored. The same holds for rows on which it failed before.
         """
         x = episode.state.x
         hidden, tick, policy = (None, 0, find_inference(self.policy)) if memory is None else memory
         if tick % self.stride:
             return torch.full((len(x),), IDLE, device=x.device), (hidden, tick + 1, policy)
         over = episode.collided.cpu()
+        if self.failed_rows:
+            over = over.clone()
+            over[list(self.failed_rows)] = True
         seen = observe(episode, self.observation)
         shown = map_kinds(lambda part: _replace_rows(part.cpu(), over).numpy(force=True), seen)
         query = PolicyQuery(shown, hidden, np.full(len(x), memory is None), over)
-        actions, hidden = query_policy(policy, self.action, query)
+        actions, hidden = query_policy(policy, self.action, query, self.failed_rows)
         actions = actions.to(x) if actions.is_floating_point() else actions.to(x.device)
         return actions, (hidden, tick + 1, policy)
 
@@ -95,14 +101,33 @@ class PolicyQuery(NamedTuple):
     over: Tensor
     """Rows whose action does not matter, boolean, shape (B,), on the CPU as all of it."""
 
+    def rows(self, part: slice) -> PolicyQuery:
+        """Return some of the rows, for a policy without a memory."""
+        return PolicyQuery(map_kinds(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
 
-def query_policy(policy: Any, kind: str, query: PolicyQuery) -> tuple[Tensor, Any]:
-    """Return what `read_actions` makes of a policy's actions, "continuous" or "meta", and its memory."""
+
+def query_policy(
+    policy: Any, kind: str, query: PolicyQuery, failed_rows: dict[int, str] | None = None
+) -> tuple[Tensor, Any]:
+    """Return what `read_actions` makes of a policy's actions, "continuous" or "meta", and its memory.
+
+    `failed_rows` takes the rows on which it fails, with the reason; they get the action of a row that does not matter.
+    An error is raised if it is None, or on a batch that cannot be split because the policy has a memory.
+    """
+    if failed_rows is None:
+        try:
+            action, hidden = _predict(policy, query)
+        except NoAnswer:  # its connection may have been lost
+            action, hidden = _predict(policy, query)
+        return read_actions(kind, action, len(query.start), query.over), hidden
     try:
-        action, hidden = _predict(policy, query)
-    except NoAnswer:  # its connection may have been lost
-        action, hidden = _predict(policy, query)
-    return read_actions(kind, action, len(query.start), query.over), hidden
+        actions, hidden, reasons = _query_with_reasons(policy, kind, query)
+    except Exception as error:  # the policy is the user's: anything may happen in it
+        if query.hidden is not None:
+            raise
+        hidden, (actions, reasons) = None, _isolate_failing_rows(policy, kind, query, error, len(query.start))
+    failed_rows.update(reasons)
+    return actions, hidden
 
 
 def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
@@ -114,6 +139,49 @@ def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
     if actions.dtype.kind not in "biuf":
         raise ValueError(f"Expected actions as numbers, one or two for each observation, got {reprlib.repr(action)}.")
     return torch.as_tensor(actions), hidden
+
+
+def _query_with_reasons(policy: Any, kind: str, query: PolicyQuery) -> tuple[Tensor, Any, dict[int, str]]:
+    """Return actions, memory, and the reasons of rows that matter with actions that are not finite."""
+    (action, hidden), over = _predict(policy, query), query.over
+    bad = torch.zeros_like(over)
+    if action.is_floating_point() and action.ndim == 2 and len(action) == len(over):
+        bad = ~torch.isfinite(action).all(dim=1) & ~over
+    reasons = dict.fromkeys(bad.nonzero()[:, 0].tolist(), "NaN or infinite actions")
+    return read_actions(kind, action, len(over), over | bad), hidden, reasons
+
+
+def _isolate_failing_rows(
+    policy: Any, kind: str, query: PolicyQuery, error: BaseException, whole: int
+) -> tuple[Tensor, dict[int, str]]:
+    """Query again after an error, in parts of the `whole` until the rows that fail stand alone.
+
+    These are the rows of one tick: no other tick is driven again. Halves take the fewest queries. If no answer came,
+    queries are cheap, but waiting for one that does not come, or for a process that starts again, is not: then the root
+    of the whole batch, and after that each row alone. The error is raised if the policy turns out to have a memory.
+    """
+    n = len(query.start)
+    root = math.isqrt(whole) if isinstance(error, NoAnswer) else (n + 1) // 2
+    size = root if 1 < root < n else 1
+    actions, reasons = list[Tensor](), dict[int, str]()
+    for first in range(0, n, size):
+        part = query.rows(slice(first, first + size))
+        try:
+            if n == 1 and isinstance(error, NoAnswer):
+                raise error  # it is not waited for once more
+            found, hidden, why = _query_with_reasons(policy, kind, part)
+        except Exception as raised:  # the policy is the user's: anything may happen in it
+            if len(part.start) > 1:
+                found, why = _isolate_failing_rows(policy, kind, part, raised, whole)
+            else:
+                nothing = torch.zeros(1, dtype=torch.int64) if kind == "meta" else torch.zeros(1, 2)
+                found, why = read_actions(kind, nothing, 1, torch.ones_like(part.over)), {0: reason_of(raised)}
+        else:
+            if hidden is not None:
+                raise error
+        actions.append(found)
+        reasons.update({first + row: reason for row, reason in why.items()})
+    return torch.cat(actions), reasons
 
 
 @dataclass(frozen=True, eq=False)

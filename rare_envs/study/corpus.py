@@ -34,7 +34,6 @@ from rare_envs.study.failures import OTHER_DRIVERS
 from rare_envs.study.question import build_problem, note_question, open_question, open_run
 from rare_envs.study.replay import REPLAY_TOLERANCE, join_parts
 from rare_envs.study.run_folder import CRASH, LoadedStudy, load_finished
-from samplers.evaluate import Evaluator
 from samplers.output import to_json_value
 from training import Retraining
 
@@ -266,9 +265,7 @@ def try_ego(
 def try_world(problem: DrivingProblem, failures: Sequence[StoredFailure]) -> list[Trial]:
     """Return the trials of the ego of a problem in scenarios of its world."""
     x = problem.space.validate(join_x(failures, problem.space))
-    evaluator = Evaluator(problem, on_error="failure")
-    f = evaluator.evaluate(x)
-    reasons = dict(zip(np.flatnonzero(np.isnan(f)).tolist(), (each.reason for each in evaluator.faults), strict=True))
+    f, reasons = problem.attempt(x)
     failed = [k for k in range(len(x)) if k not in reasons and f[k] <= failures[k].gamma]
     kinds = dict(zip(failed, problem.crash_kinds(x[failed]) if failed else (), strict=True))
     return [

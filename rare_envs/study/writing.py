@@ -98,7 +98,7 @@ def _of_any_chunk(head: Mapping[str, Any]) -> dict[str, Any]:
     return {**head, "question": question, "whole": dict(head.get("whole") or {}) | {"chunked": None}}
 
 
-def find_whole(folder: Path) -> tuple[Path, dict[str, Any], dict[str, Question]]:
+def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], dict[str, Question]]:
     """Return the folder of an unfinished run, its command with arguments, and the questions of the parts begun.
 
     The command is empty for a single estimate; a folder of a part of a comparison means that of the comparison. Parts
@@ -110,13 +110,13 @@ def find_whole(folder: Path) -> tuple[Path, dict[str, Any], dict[str, Question]]
     wholes, questions = list[dict[str, Any]](), dict[str, Question]()
     for path in paths:
         part = path.parent
-        journal, question = continue_journal(part)
+        journal, question = continue_journal(part, mend)
         questions[str(part) if sums else "" if paths is own else part.name] = question
         wholes.append(dict(journal.head.get("whole") or {}))
         journal.close()
     whole, command = wholes[0], wholes[0].get("command")
     if not sums and (command == SUM or (paths is own and command == "compare")):
-        return find_whole(folder.parent)
+        return find_whole(folder.parent, mend)
     if paths is own:
         return folder, whole if command == "estimate" else {}, questions
     if not whole or any(each != whole for each in wholes) or (sums and command != SUM):
@@ -125,11 +125,11 @@ def find_whole(folder: Path) -> tuple[Path, dict[str, Any], dict[str, Question]]
     return folder, whole, questions
 
 
-def continue_journal(folder: Path) -> tuple[Journal, Question]:
-    """Return the journal of an unfinished run, and its question."""
+def continue_journal(folder: Path, mend: bool = False) -> tuple[Journal, Question]:
+    """Return the journal of an unfinished run, and its question; of a damaged one `mend` keeps what is before that."""
     path, begun = folder / run_folder.JOURNAL, "stopped before its first simulations"
     try:
-        journal = Journal.open(path)
+        journal = Journal.open(path, mend)
     except FileNotFoundError as error:
         there = f"it has no {run_folder.JOURNAL}" if folder.is_dir() else "the folder does not exist"
         why = f"{there}. If the run was {begun}, {BEGIN_AGAIN}"
@@ -141,7 +141,12 @@ def continue_journal(folder: Path) -> tuple[Journal, Question]:
     except OSError as error:
         raise BadInput(f"Cannot resume {str(path)!r}: {error.strerror}.") from error
     except JournalError as error:
-        raise BadInput(error) from error
+        advice = ""
+        if "damaged from its first record on" in str(error):
+            advice = " Nothing can be taken from it: it is left as it is, and the command with --force replaces it."
+        elif "damaged" in str(error):
+            advice = f" To keep what is before the damage: {advise_resume(folder)} --mend."
+        raise BadInput(f"{error}{advice}") from error
     version = journal.head.get("version")
     try:
         if version != __version__:

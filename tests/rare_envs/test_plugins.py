@@ -47,13 +47,14 @@ def test_what_cannot_be_imported_is_one_line(own_module: str) -> None:
     assert sys.path == before
 
 
-def test_an_interruption_that_code_turns_into_its_own_end_stays_one() -> None:
+@pytest.mark.parametrize("other", [KeyboardInterrupt, SystemExit])
+def test_an_interruption_by_the_user_that_code_raises_again_stays_one(other: type[BaseException]) -> None:
     def stop(by_user: bool) -> None:
         try:
             if by_user:
                 signal.raise_signal(signal.SIGINT)
         finally:
-            sys.exit("stopped")
+            raise other("stopped")
 
     with pytest.raises(KeyboardInterrupt), as_errors():
         stop(by_user=True)

@@ -121,6 +121,60 @@ def test_f_can_write_on_its_points_and_set_errors_of_numpy():
     assert np.geterr() == before
 
 
+def test_a_problem_that_goes_on_by_itself_is_not_split():
+    class Rowwise:
+        dim, base, sizes = 2, StandardNormal(2), []
+
+        def evaluate(self, x):
+            raise AssertionError("its rows are asked for")
+
+        def attempt(self, x):
+            self.sizes.append(len(x))
+            bad = np.flatnonzero(x[:, 0] == 2)
+            return np.where(x[:, 0] == 2, np.nan, x[:, 0]), dict.fromkeys(bad.tolist(), "the ego raised")
+
+    one = Evaluator(Rowwise(), on_error="bound")
+    np.testing.assert_array_equal(one.evaluate(X), [1.0, 3.0, np.nan, 4.0, -1.0])
+    assert (Rowwise.sizes, one.faults[0].reason, one.n_retried) == ([5, 1], "the ego raised", 1)
+
+
+class Plain:
+    """f is 1 everywhere, by the batch and by the row."""
+
+    dim, base = 2, StandardNormal(2)
+
+    def evaluate(self, x):
+        return np.ones(len(x))
+
+    def attempt(self, x):
+        return np.ones(len(x)), {}
+
+
+class Shifted(Plain):
+    def evaluate(self, x):
+        return super().evaluate(x) - 3.0
+
+
+class Around:
+    def __init__(self, problem):
+        self.problem = problem
+
+    def __getattr__(self, name):
+        return getattr(self.problem, name)
+
+    def evaluate(self, x):
+        return self.problem.evaluate(x) - 3.0
+
+
+def test_an_f_of_ones_own_is_the_one_that_counts():
+    """In a subclass, in a wrapper and on an instance."""
+    changed = Plain()
+    changed.evaluate = lambda x: np.full(len(x), -2.0)
+    for problem in (Shifted(), Around(Plain()), changed):
+        assert set(Evaluator(problem).evaluate(X)) == {-2.0}
+    assert set(Evaluator(Plain()).evaluate(X)) == {1.0}
+
+
 # Terms and gradients
 
 

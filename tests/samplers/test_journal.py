@@ -124,42 +124,45 @@ def damage(path: Path, statement: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("statement", "number"),
-    [
-        ("UPDATE chunks SET numbers = zeroblob(length(numbers)) WHERE id = 3", 4),
-        ("DELETE FROM chunks WHERE id = 3", 4),
-        ("UPDATE chunks SET notes = '{}' WHERE id = 0", 1),
-    ],
+    "statement",
+    ["UPDATE chunks SET numbers = zeroblob(length(numbers)) WHERE id = 3", "DELETE FROM chunks WHERE id = 3"],
 )
-def test_a_damaged_record_is_refused(statement: str, number: int, tmp_path: Path) -> None:
+def test_a_damaged_record_is_refused_and_those_before_it_can_be_kept(statement: str, tmp_path: Path) -> None:
     path, method = tmp_path / "j", samplers.MonteCarlo(batch=500)
     problem = samplers.FunctionProblem(half_space, 4)
-    samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
+    whole = samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
     damage(path, statement)
-    content = path.read_bytes()
-    with pytest.raises(JournalError, match=f"record {number} does not match its checksum") as caught:
+    with pytest.raises(JournalError, match="is damaged: record 4 does not match its checksum"):
         samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
-    assert not isinstance(caught.value, NothingRecorded)
-    assert path.read_bytes() == content
+    journal = Journal.open(path, mend=True)
+    assert journal.n == 1000
+    journal.close()
+    assert [file.name for file in tmp_path.iterdir()] == ["j"]
+    assert samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path) == whole
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_a_journal_that_lost_a_page_is_refused(cut: bool, tmp_path: Path) -> None:
+def test_a_page_that_is_lost_costs_what_stands_behind_it(cut: bool, tmp_path: Path) -> None:
     path = tmp_path / "j"
     journal = Journal.create(path, {"seed": 1})
     for k in range(40):
         journal.append(str(k), np.full((300, 1), float(k)), {}, 300)
     journal.close()
-    content = path.read_bytes()
+    content = bytearray(path.read_bytes())
     half = len(content) // 2
-    path.write_bytes(content[:half] if cut else content[:half] + bytes(4096) + content[half + 4096 :])
-    with pytest.raises(JournalError, match="is damaged"):
+    content = content[:half] if cut else content[:half] + bytes(4096) + content[half + 4096 :]
+    path.write_bytes(content)
+    with pytest.raises(JournalError, match="is damaged: its end is missing" if cut else "is damaged: record"):
         Journal.open(path)
+    journal = Journal.open(path, mend=True)
+    assert 300 <= journal.n < 12_000 and journal.head == {"seed": 1}
+    assert journal.find("0") is not None
+    journal.close()
 
 
-@pytest.mark.parametrize("n_bytes", [4096, 20480])
+@pytest.mark.parametrize(("n_bytes", "mend"), [(4096, False), (4096, True), (20480, False)])
 def test_killed_while_sqlite_copies_its_log_into_the_file_nothing_is_lost(
-    n_bytes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    n_bytes: int, mend: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first page, which tells the length of the whole file, is copied first."""
     monkeypatch.setattr(journals, "SYNC_SECONDS", np.inf)
@@ -167,13 +170,25 @@ def test_killed_while_sqlite_copies_its_log_into_the_file_nothing_is_lost(
     with contextlib.closing(Journal.create(path, {})) as journal:
         for number in range(20):
             journal.append(str(number), np.full((200, 1), number), {}, 200)
-        before, log = path.read_bytes(), path.with_name("journal.bin-wal").read_bytes()
+        before, log = path.read_bytes(), journals._wal(path).read_bytes()
     after = path.read_bytes()
     assert len(after) > 20480 >= len(before)
     killed.write_bytes(after[:n_bytes] + before[n_bytes:])
-    killed.with_name("killed.bin-wal").write_bytes(log)
-    with contextlib.closing(Journal.open(killed)) as journal:
+    journals._wal(killed).write_bytes(log)
+    with contextlib.closing(Journal.open(killed, mend)) as journal:
         assert journal.n == 4000
+
+
+@pytest.mark.parametrize("mend", [False, True])
+def test_a_journal_whose_head_is_damaged_is_left_as_it_is(mend: bool, tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    run(path, method="mc")
+    damage(path, "UPDATE chunks SET notes = '{}' WHERE id = 0")
+    content = path.read_bytes()
+    with pytest.raises(JournalError, match="damaged from its first record on") as caught:
+        Journal.open(path, mend)
+    assert not isinstance(caught.value, NothingRecorded)
+    assert path.read_bytes() == content
 
 
 def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
@@ -206,8 +221,11 @@ def test_nothing_is_written_through_a_journal_that_is_elsewhere_too(end: str, tm
     for put in (beside.symlink_to, beside.hardlink_to):
         beside.unlink(missing_ok=True)
         put(other)
-        with pytest.raises(JournalError, match=r"has another name too, .* put a copy|journal', which no run leaves"):
-            Journal.open(path)
+        for mend in (False, True):
+            with pytest.raises(
+                JournalError, match=r"has another name too, .* put a copy|journal', which no run leaves"
+            ):
+                Journal.open(path, mend)
         with pytest.raises(JournalError, match="There is a journal already"):
             Journal.create(path, {})
     Journal.create(path, {}, replace=True).close()

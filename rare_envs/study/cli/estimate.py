@@ -325,13 +325,16 @@ def resume_command(
     executor: Any,
     ego: Annotated[str | None, Option(help="New address of an ego in another program, tcp://HOST:PORT.")] = None,
     on_error: Annotated[str | None, Option(help="New value of on_error: raise, failure or bound.")] = None,
+    mend: Annotated[
+        bool, Option("--mend", help="Keep the simulations before the damage of a damaged journal.")
+    ] = False,
     details: options.DetailsOption = False,
 ) -> Answer:
     """Continue an interrupted estimate, risk or compare; the result is the same as without the interruption."""
     from rare_envs.study import compared_risks, comparison, evaluate, writing
 
     trust = asked["trust"]
-    folder, whole, questions = writing.find_whole(run)
+    folder, whole, questions = writing.find_whole(run, mend)
     if whole and (ego or on_error):
         begun = (folder / name for name in questions)
         part = shlex.quote(str(next((each for each in begun if not (each / RESULT).exists()), folder)))

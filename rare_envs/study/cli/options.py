@@ -21,7 +21,7 @@ PANELS = {
     "Question": "measure gamma",
     "Precision and budget": "method max_sim target_cov confidence plan",
     "Gate": "max_p max_rate max_ratio assume_traffic",
-    "Run": "seed workers executor address time_limit memory_limit on_error config trust",
+    "Run": "seed workers executor address time_limit memory_limit on_error mend config trust",
     "Output": "out force details as_json help",
 }
 """Titles of the sections of a help page and their options, most used first; others are in a section before these."""

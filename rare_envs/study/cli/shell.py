@@ -78,7 +78,7 @@ class OneLineErrors(TyperGroup):
                 code = super().main(*args, **{**extra, "standalone_mode": False})
                 ended = code != 128 + signal.SIGINT
         except _UsageError as error:
-            if advice := advise_file(error, words):
+            if advice := advise_elsewhere(error, words):
                 _fail(advice)
             said = getattr(error, "format_message")()  # noqa: B009  (differs by version)
             for pattern, plain in _PLAIN_WORDS:
@@ -116,9 +116,41 @@ class OneLineErrors(TyperGroup):
         return " ".join(path)
 
 
-def advise_file(error: Exception, words: Sequence[str]) -> str:
-    """Return how to give an option that a line of words has in vain in a file for --config; empty if no file has it."""
-    option, context = getattr(error, "option_name", None) or "", getattr(error, "ctx", None)
+ELSEWHERE = {
+    "plan": "rare-envs estimate SCENARIO --plan",
+    "bases": "rare-envs list SCENARIO, or rare-envs list bases",
+    "export-ego": "rare-envs export EGO.zip EGO.onnx",
+    "train-drivers": "python -m training.imitation",
+    "serve-ego": "python -m agents.remote",
+    "bench": "python -m benchmarks.samplers",
+}
+"""Words that are no command, and the command that does what they say."""
+
+
+SYNONYMS = {
+    **dict.fromkeys(("--cov", "--precision", "--target"), "--target-cov"),
+    **dict.fromkeys(("--pilot", "--budget", "--samples", "--simulations", "--n-sim", "--n"), "--max-sim"),
+    **dict.fromkeys(("--given-base", "--assume-base"), "--assume-traffic"),
+    **dict.fromkeys(("--jobs", "--threads", "--processes", "--n-jobs"), "--workers"),
+    **dict.fromkeys(("--policy", "--model"), "--ego"),
+    **dict.fromkeys(("--traffic", "--bases", "--distribution"), "--base"),
+    **dict.fromkeys(("--output", "--folder", "--dir"), "--out"),
+    **dict.fromkeys(("--most", "--max"), "--limit"),
+    **dict.fromkeys(("--scenarios", "--env"), "--scenario"),
+}
+"""Words for options that people may think of first, and the options."""
+
+
+def advise_elsewhere(error: Exception, words: Sequence[str]) -> str:
+    """Return where an option or a command is that a line of words has in vain; empty if there is no such place."""
+    option, context = getattr(error, "option_name", None), getattr(error, "ctx", None)
+    if option is None:
+        typed = re.match("No such command '(.*?)'", getattr(error, "message", ""))
+        better = ELSEWHERE.get(typed[1]) if typed else None
+        return f"No such command {typed[1]!r}: it is {better}." if typed and better else ""
+    parameters = getattr(getattr(context, "command", None), "params", ())
+    if (better := SYNONYMS.get(option)) in [name for each in parameters for name in each.opts]:
+        return f"No such option {option}: it is {better}."
     keys = getattr(getattr(getattr(context, "command", None), "callback", None), "file_keys", ())
     key = option.lstrip("-").replace("-", "_")
     is_off = key.startswith("no_") and key[3:] in keys

@@ -46,7 +46,7 @@ def full_disk(*_: Any, **__: Any) -> Any:
 
 
 def act_after(
-    rows: int, act: Callable[[], Any], patch: pytest.MonkeyPatch, owner: Any = DrivingProblem, name: str = "evaluate"
+    rows: int, act: Callable[[], Any], patch: pytest.MonkeyPatch, owner: Any = DrivingProblem, name: str = "attempt"
 ) -> None:
     """Act each time that more than some rows have been simulated, before they are."""
     simulate, made = getattr(owner, name), [0]

@@ -56,6 +56,10 @@ def gives_nan(actions: Any, short: Any) -> Any:
     return actions
 
 
+def interrupts(actions: Any, short: Any) -> Any:
+    raise KeyboardInterrupt
+
+
 def cancels(actions: Any, short: Any) -> Any:
     raise asyncio.CancelledError("late")
 
@@ -63,6 +67,7 @@ def cancels(actions: Any, short: Any) -> Any:
 FAILING = {
     "raises": (raises, "RuntimeError: no road"),
     "ends the program": (stops, "SystemExit(7)"),
+    "raises what Ctrl-C does": (interrupts, "KeyboardInterrupt()"),
     "cancels": (cancels, "CancelledError('late')"),
     "gives NaN": (gives_nan, "NaN or infinite actions"),
     "gives infinity": (lambda actions, short: np.where(short[:, None], np.inf, actions), "NaN or infinite actions"),
@@ -123,6 +128,18 @@ def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:
     with pytest.raises(EgoGone, match="not there"):
         samplers.estimate(problem(Coasting(gone)), "mc", gamma=3.0, max_sim=300, seed=0, on_error="bound")
     assert len(calls) == 2
+
+
+@pytest.mark.parametrize("how", ["raises", "gives NaN"])
+def test_terms_of_the_same_scenarios_are_lost_and_no_others(how: str, x: np.ndarray) -> None:
+    fail, reason = FAILING[how]
+    bad, expected = x[:, 2] < GAP, problem(Coasting()).terms(x)
+    found, reasons = problem(Coasting(fail)).attempt_terms(x, 0.0)
+    np.testing.assert_array_equal(found.f, np.where(bad, np.nan, expected.f))
+    np.testing.assert_array_equal(found.values, np.where(bad[:, None], np.nan, expected.values))
+    np.testing.assert_array_equal(found.ticks[~bad], expected.ticks[~bad])
+    assert (found.threshold, found.names) == (expected.threshold, expected.names)
+    assert sorted(reasons) == np.flatnonzero(bad).tolist() and all(reason in each for each in reasons.values())
 
 
 FAULTY = """
@@ -310,7 +327,7 @@ def test_what_one_executor_began_another_continues(
     whole = evaluate.run(prepare(ask("nan", risky, chunk=chunk)))
     with monkeypatch.context() as patch:
         act_after(230, interrupt, patch)
-        with pytest.raises(evaluate.RunInterrupted, match="simulations are kept"):
+        with pytest.raises(evaluate.RunInterrupted, match="200 simulations are kept"):
             evaluate.run_into(faulty / "run", prepare(ask("nan", risky, chunk=chunk)))
     assert (faulty / "run" / JOURNAL).exists()
     report = evaluate.resume(faulty / "run", executor=samplers.executors.LocalProcesses(1))

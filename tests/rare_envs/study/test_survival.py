@@ -178,10 +178,22 @@ def test_nobody_else_takes_the_journal(asked: Question) -> None:
     assert evaluate.resume(RUN, trust=True).estimate.n_sim == 1200
 
 
-def test_values_of_f_that_were_zeroed_are_refused(asked: Question, cli: Cli) -> None:
+def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_kept(asked: Question, cli: Cli) -> None:
+    run_whole(asked)
     leave(asked)
-    change(RUN / JOURNAL, "UPDATE chunks SET numbers = zeroblob(1600) WHERE id = 2")
-    assert_refused(cli("resume", "run"), "damaged (record 3 does not match its checksum): remove it to start again")
+    journal = RUN / JOURNAL
+    content = journal.read_bytes()
+    change(journal, "UPDATE chunks SET notes = '{}' WHERE id = 0")
+    damaged = journal.read_bytes()
+    for words in (("resume", "run"), ("resume", "run", "--mend")):
+        assert_refused(cli(*words), "damaged from its first record on", "with --force replaces it")
+        assert journal.read_bytes() == damaged
+    journal.write_bytes(content)
+    change(journal, "UPDATE chunks SET numbers = zeroblob(1600) WHERE id = 2")
+    assert_refused(cli("resume", "run"), "damaged: record 3 does not match its checksum", "--mend")
+    done = cli("resume", "run", "--mend", "--json")
+    assert done.exit_code in (0, 3), done.stderr
+    assert_same_as_whole()
 
 
 class Unstarted:
@@ -319,7 +331,7 @@ def test_a_folder_that_is_deleted_in_mid_run(
 ) -> None:
     words = (*SMALL[:-1], 600, "--base", risky, "--json", "--out")
     whole = cli(*words, "whole")
-    simulate, rows = DrivingProblem.evaluate, [0]
+    attempt, rows = DrivingProblem.attempt, [0]
 
     def deleting(self: DrivingProblem, x: Any) -> Any:
         rows[0] += len(x)
@@ -327,9 +339,9 @@ def test_a_folder_that_is_deleted_in_mid_run(
             shutil.rmtree("runs")
             if not back:
                 Path("runs").touch()  # a file where the folder was
-        return simulate(self, x)
+        return attempt(self, x)
 
-    monkeypatch.setattr(DrivingProblem, "evaluate", deleting)
+    monkeypatch.setattr(DrivingProblem, "attempt", deleting)
     ended = cli(*words, "runs/one")
     assert json.loads(ended.stdout)["p"] == json.loads(whole.stdout)["p"] > 0
     assert "Traceback" not in ended.stderr
@@ -344,7 +356,7 @@ def test_a_folder_that_is_deleted_in_mid_run(
 def test_an_ego_that_changes_the_working_directory(
     asked: Question, frail: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    elsewhere, before = frail / "elsewhere", DrivingProblem.evaluate
+    elsewhere, before = frail / "elsewhere", DrivingProblem.attempt
     elsewhere.mkdir()
 
     def moving(self: DrivingProblem, x: Any) -> Any:
@@ -352,7 +364,7 @@ def test_an_ego_that_changes_the_working_directory(
         return before(self, x)
 
     study = prepare(replace(asked, ego="idm", max_sim=400))
-    monkeypatch.setattr(DrivingProblem, "evaluate", moving)
+    monkeypatch.setattr(DrivingProblem, "attempt", moving)
     evaluate.run_into(RUN, study)
     assert names_in(frail / "run") == TABLES
     assert not list(elsewhere.iterdir())
