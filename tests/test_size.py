@@ -11,13 +11,13 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_570,
-    "code lines": 36_580,
+    "package lines": 57_475,
+    "code lines": 36_500,
     "modules": 213,
-    "functions": 3_214,
-    "classes": 473,
+    "functions": 3_210,
+    "classes": 472,
     "import lines, percent of code": 10.5,
-    "test lines": 33_970,
+    "test lines": 33_925,
     "pages": 18,
     "words of pages": 37_070,
     "files entered by an estimate": 43,

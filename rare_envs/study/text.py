@@ -23,8 +23,7 @@ from rare_envs.measures import MEASURES
 from rare_envs.people import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.plugins import clean_text
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT, CUTTER
-from rare_envs.scenarios.registry import find_scenario
-from rare_envs.study.arguments import GATE_CODES, Question, read_question
+from rare_envs.study.arguments import GATE_CODES, Question
 from rare_envs.study.episodes import MAX_SHOWN, Column, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.failures import KIND_DESCRIPTIONS
 from rare_envs.study.replay import describe_contact
@@ -237,42 +236,6 @@ Result = Mapping[str, Any]
 """What result.json holds."""
 
 
-def explain_run(result: Result, about: Mapping[str, Any]) -> list[str]:
-    """Return what p of a run means and what not, in sentences."""
-    question, base = result["question"], about.get("base") or {}
-    scenario = find_scenario(question["env_id"]).name
-    noun = EVENT_NOUNS.get(scenario, "scenarios")
-    fitted = f", which was fitted to {base['fitted_to']}" if base.get("fitted_to") else ""
-    event = "a crash of the ego" if not explain_other_events(read_question(question)) else "a failure, f <= gamma"
-    return [
-        f"The ego {question['ego']} drove {result['n_sim']:,} simulated {noun} from the traffic model "
-        f"{Path(base.get('name') or question['base'] or 'of the scenario').name}{fitted}.",
-        f"The number is how often such {noun} end in {event}. It says nothing of other situations.",
-        OPEN_ERRORS,
-        *_explain_calibration(result.get("events") or []),
-        f"A kind of failure that is rarer than {format_probability(result.get('unseen'))} and that no simulation came "
-        "near would not have been seen.",
-    ]
-
-
-OPEN_ERRORS = (
-    "The interval has the errors of few simulations and of few recordings. It does not have that of other roads, "
-    "weather and drivers than those recorded."
-)
-
-
-def _explain_calibration(events: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what the human driver model says about rates, as one sentence; none where there is no rate."""
-    far = [EVENT_NOUNS.get(each["event"], each["event"]) for each in events if each["uncalibrated"]]
-    if far:
-        return [
-            f"In {' and '.join(far)} the human driver model was not compared with people, or does not crash as often "
-            "as they do: compare egos by this rate, and do not read it as a forecast."
-        ]
-    near = f"within a factor {people.CALIBRATED_WITHIN:g} of people's interval"
-    return [f"In these events the crash rate of the human driver model is {near}."] if events else []
-
-
 def explain_reference(result: Result) -> list[str]:
     """Return a sentence for each reference driver that crashes more often than people in the events of a run.
 
@@ -293,44 +256,12 @@ def explain_reference(result: Result) -> list[str]:
     ]
 
 
-def explain_risk(risk: Result) -> list[str]:
-    """Return what the sum of a risk means and what not, in sentences."""
-    nouns = [EVENT_NOUNS.get(name, name) for name in risk["scenarios"]]
-    left_out = [name_scenario(name) for name in risk.get("left_out") or {}]
-    return [
-        f"The ego {risk['ego']} drove simulated {' and '.join(nouns)}. The probability of a crash in each is "
-        "multiplied by how often such events were counted per km, and the products are added.",
-        "The sum says nothing of crashes in other situations"
-        f"{f', nor in {chr(32).join(left_out)}, which was left out' if left_out else ''}.",
-        OPEN_ERRORS,
-        *_explain_calibration(risk["events"]),
-    ]
-
-
-def explain_comparison(found: Result) -> list[str]:
-    """Return what the ratio of a comparison means and what not, in sentences."""
+def is_better_known(found: Result) -> bool:
+    """Return whether the ratio of a comparison has narrower intervals than the probability of either ego."""
     base, of_either = found["base_uncertainty"], found["either"]["base_uncertainty"]
     pairs = [(found["interval"], found[side]["interval"]) for side in ("a", "b")]
     pairs += [(base["interval"], of_either["interval"])] if base and of_either else []
-    better = all(_log_width(ratio) < _log_width(p) for ratio, p in pairs)
-    known = ", so their ratio is known better than either probability" if better else ""
-    return [
-        f"Both egos drove the same {found['n_sim'] // 2:,} scenarios{known}.",
-        "The ratio is of this scenario and traffic model. In another one the order of the two may differ.",
-        "A kind of failure that no simulation of either came near would not have been seen.",
-    ]
-
-
-def explain_compared_risks(found: Result) -> list[str]:
-    """Return what a comparison summed over scenarios means and what not, in sentences."""
-    nouns = " and ".join(EVENT_NOUNS.get(name, name) for name in found["scenarios"])
-    return [
-        f"Both egos drove the same simulated {nouns}. The probability of each outcome is multiplied by how often such "
-        "events were counted per km, and the products are added.",
-        "Near-crashes need a rapid manoeuvre, and include crashes; injuries are serious ones (MAIS 3 "
-        "or more) of both vehicles.",
-        "A kind of failure that no simulation of either came near would not have been seen.",
-    ]
+    return all(_log_width(ratio) < _log_width(p) for ratio, p in pairs)
 
 
 def _log_width(ends: Sequence[float | None] | None) -> float:

@@ -20,8 +20,10 @@ from scipy.spatial import KDTree
 
 from rare_envs.envs.rendering import CRASH_COLOUR, ROLE_COLOURS
 from rare_envs.files import parse_json_object, read_text_file, replace_text
+from rare_envs.people import CALIBRATED_WITHIN
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.problem import DrivingProblem
+from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study import plots, text
 from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
 from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, format_value, list_columns
@@ -29,6 +31,7 @@ from rare_envs.study.html_report import figures as drawings
 from rare_envs.study.html_report.figures import FigureOfPage
 from rare_envs.study.question import open_question, open_run, prepare, split_question, warn_of_changed_files
 from rare_envs.study.replay import Drive, describe_contact, drive_again, read_row
+from rare_envs.study.report import explain_other_events
 from rare_envs.study.run_folder import (
     COMPARISON,
     EPISODES,
@@ -264,6 +267,7 @@ def _environment() -> jinja2.Environment:
     )
     environment.globals |= {
         "nouns": text.EVENT_NOUNS,
+        "calibrated_within": CALIBRATED_WITHIN,
         "other_nouns": text.OTHER_NOUNS,
         "parts": text.describe_parts,
         "share": text.format_share,
@@ -301,7 +305,8 @@ def _describe_run(
         atlas, figures = build_atlas(study, problem, known, prefix, share), _make_figures(study, problem, prefix)
         own, noted = ([str(each) for name in names for each in result.get(name) or []] for names in (["doubts"], NOTED))
         resolved = all(part["resolved"] for part in result.get("parts") or [])
-        base, edited = result.get("base_uncertainty"), f"not what the run wrote, by the digests in its {STUDY}: "
+        about, base = study.about.get("base") or {}, result.get("base_uncertainty")
+        edited = f"not what the run wrote, by the digests in its {STUDY}: "
         return {
             "title": f"How often does {study.question['ego']} fail in {study.question['env_id']}?",
             "prefix": prefix,
@@ -311,7 +316,10 @@ def _describe_run(
             "folder": str(folder),
             "quoted_folder": shlex.quote(str(folder)),
             "answer": unfold_rows(result["text"][1:]),
-            "meaning": text.explain_run(result, study.about),
+            "noun": text.EVENT_NOUNS.get(find_scenario(question.env_id).name, "scenarios"),
+            "traffic": Path(about.get("name") or question.base or "of the scenario").name,
+            "fitted_to": about.get("fitted_to"),
+            "collides": not explain_other_events(question),
             "reference": text.explain_reference(result),
             "doubts": [*([edited + ", ".join(changed)] if changed else []), *own],
             "remarks": [each for each in noted if each not in own],
@@ -349,7 +357,6 @@ def _describe_risk(folder: Path, trust: bool) -> dict[str, Any]:
             "result": total,
             "headline": " ".join(lines[:1] if "per km" in lines[1] else lines[:2]),
             "answer": unfold_rows(lines[last + 1 :]),
-            "meaning": text.explain_risk(total),
             "doubts": [str(each) for each in total["warnings"]],
             "runs": runs,
             "limits": {name: dict(run["answer"]).get("Limited by", "") for name, run in runs.items()},
@@ -377,7 +384,6 @@ def _describe_comparison(folder: Path, trust: bool) -> dict[str, Any]:
             "title": f"{found['ego_a']} (A) against {found['ego_b']} (B)",
             "result": found,
             "answer": found["text"],
-            "meaning": text.explain_compared_risks(found),
             "doubts": [str(each) for each in found["warnings"]],
             "outcomes": list_outcomes({"crashes": found, **found["outcomes"]}),
             "avoided": list_avoided(found["kinds_of_a"]),
@@ -434,7 +440,7 @@ def _describe_pair(folder: Path, found: Mapping[str, Any], trust: bool, prefix: 
             "title": f"{questions[0].ego} (A) against {questions[1].ego} (B) in {questions[0].env_id}",
             "result": found,
             "answer": found["text"],
-            "meaning": text.explain_comparison(found),
+            "better_known": text.is_better_known(found),
             "doubts": [str(each) for each in found["warnings"]],
             "fail": dict(zip([*outcomes, "Neither fails"], found["shares"].values(), strict=True)),
             "outcomes": list_outcomes({"failures": found, **found["severity"]}),

@@ -30,9 +30,9 @@ from rare_envs.study.report import describe_left_out, find_frequency, fold_sprea
 from rare_envs.study.risk import compare_sites
 from rare_envs.study.text import (
     describe_calibration,
-    explain_comparison,
     format_rate,
     format_with_interval,
+    is_better_known,
     tabulate_events,
 )
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
@@ -453,7 +453,7 @@ def test_a_ratio_is_called_better_known_if_it_is_and_what_no_draw_showed_has_a_l
     found = add_up(cut_in=([*range(9)], [*range(9)]))
     pair = found.scenarios["cut_in"]
     for ends, better in (((0.9, 1.1), True), ((0.01, 100.0), False)):
-        assert ("known better" in explain_comparison(replace(pair, interval=ends).to_dict())[0]) == better
+        assert is_better_known(replace(pair, interval=ends).to_dict()) == better
     row = next(line for line in str(found).splitlines() if line.startswith("crashes  "))
     assert row.split()[-5:-1] == ["below", "39,000"] * 2  # 36,000 of 100 draws, times 1.06 for the count of events
 
