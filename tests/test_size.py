@@ -11,13 +11,13 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_475,
-    "code lines": 36_500,
+    "package lines": 57_650,
+    "code lines": 36_625,
     "modules": 213,
-    "functions": 3_210,
+    "functions": 3_225,
     "classes": 472,
     "import lines, percent of code": 10.5,
-    "test lines": 33_925,
+    "test lines": 33_975,
     "pages": 18,
     "words of pages": 37_070,
     "files entered by an estimate": 43,

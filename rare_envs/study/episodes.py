@@ -190,8 +190,7 @@ class EpisodeTable:
         found, rows = np.full(n, None, dtype=object), np.flatnonzero(failed)
         if len(rows) and crashes:  # null where a failure was not driven again
             failing = part.take(pa.array(rows)).combine_chunks()
-            x = np.hstack([_as_array(failing[name].chunk(0)) for name in self._columns])
-            found[rows] = [crashes.get(digest) for digest in digest_scenarios(x)]
+            found[rows] = [crashes.get(digest) for digest in digest_scenarios(_stack(failing, self._columns))]
         return {
             "simulation": pa.array(np.arange(first, first + n)),
             "run": pa.array(about.run, type=pa.int32()),
@@ -215,6 +214,16 @@ def _join_batches(draft: Iterable[pa.RecordBatch], rows: int) -> Iterator[pa.Tab
             waiting, count = [], 0
     if waiting:
         yield pa.Table.from_batches(waiting)
+
+
+def read_scenarios(table: pa.Table, space: ScenarioSpace) -> NDArray[np.float32]:
+    """Return the scenarios x (n, d) of a table of simulations."""
+    return _stack(table.combine_chunks(), name_columns(space))
+
+
+def _stack(table: pa.Table, columns: Iterable[str]) -> NDArray[np.float32]:
+    """Return columns of a table, of one chunk each, as an array of shape (n, d)."""
+    return np.hstack([_as_array(table[name].chunk(0)) for name in columns])
 
 
 def _as_array(column: pa.Array) -> NDArray[np.float32]:

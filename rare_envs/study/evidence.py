@@ -14,9 +14,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -27,24 +28,38 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from scipy.stats import poisson
 
-from rare_envs.files import digest_file, format_json, open_ordinary, parse_json_object, read_text_file, replace_text
+from rare_envs.files import format_json, open_ordinary, parse_json_object, read_text_file, replace_text
 from rare_envs.plugins import clean_text
-from rare_envs.study.arguments import as_bad_input, output_folder
-from rare_envs.study.episodes import draw_ordinary, find_ordinary_range, list_columns
+from rare_envs.startup import __version__
+from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
+from rare_envs.study.episodes import (
+    digest_scenarios,
+    draw_ordinary,
+    find_ordinary_range,
+    list_columns,
+    name_columns,
+    read_scenarios,
+)
+from rare_envs.study.evaluate import run
 from rare_envs.study.export import export_drive
 from rare_envs.study.question import Study, open_run, prepare
 from rare_envs.study.replay import REPLAY_TOLERANCE, Drive, drive_again, read_row
-from rare_envs.study.run_folder import EVIDENCE, RESULT, RISK, LoadedStudy, load_finished
-from rare_envs.study.text import describe_kind, format_probability, format_rate
+from rare_envs.study.report import Repeatability, Report
+from rare_envs.study.risk import Risk, ScenarioRisk
+from rare_envs.study.run_folder import COMPARISON, DIGESTED, EVIDENCE, RESULT, RISK, STUDY, LoadedStudy, load_finished
+from rare_envs.study.text import describe_kind, format_probability, format_rate, name_scenario, report_as_json
 from rare_envs.study.writing import remove_evidence
 from samplers.output import to_json_value
-from samplers.problem import FloatArray
+from samplers.problem import EvaluationError, FloatArray
 
-__all__ = ["EVIDENCE", "SCHEMA", "Leaf", "judge_leaf", "write_evidence"]
+__all__ = ["EVIDENCE", "SCHEMA", "judge_leaf", "write_evidence"]
 
 COVERAGE, UNCERTAINTY, VALIDATION = "coverage.json", "uncertainty.json", "validation.json"
-TRAFFIC, TEST_CASES, MANIFEST, CLAIMS = "traffic.json", "test_cases.json", "manifest.json", "claims.json"
-FILES = (COVERAGE, UNCERTAINTY, VALIDATION, TRAFFIC, TEST_CASES, MANIFEST, CLAIMS)
+TRAFFIC, TEST_CASES, ORIGIN, CLAIMS = "traffic.json", "test_cases.json", "origin.json", "claims.json"
+FILES = (COVERAGE, UNCERTAINTY, VALIDATION, TRAFFIC, TEST_CASES, ORIGIN, CLAIMS)
+"""Files of a run; those of a risk, a sum over scenarios, have neither traffic nor test cases of their own."""
+MANIFEST = "manifest.json"
+"""SHA-256 digests of all others; its own digest is to be kept elsewhere."""
 PICTURE, PAGE, SCHEMA_FILE = "claims.svg", "evidence.html", "evidence.schema.json"
 DISCLAIMER = (
     "This folder documents a simulation study. It is no conformity assessment and no approval, and it does not "
@@ -52,15 +67,17 @@ DISCLAIMER = (
 )
 _SCHEMA = resources.files("rare_envs") / "data" / "evidence_schema.json"
 SCHEMA: dict[str, Any] = json.loads(_SCHEMA.read_text("utf-8"))
-"""JSON schema of all files of the evidence together, {name: content}."""
+"""JSON schema of all files of the evidence together, {name: content}; of a run, or of a risk."""
 N_COMPARED = 1_000
 """Ordinary scenarios that both simulators drive."""
 MOST_CASES = 20
 """Test cases at most."""
 ENOUGH_COV = 0.3
 """Largest relative standard error of p at which the simulations are called enough."""
-SUM_TOLERANCE = 1e-6
-"""Largest relative difference of p from the sum of weights, and of the rate from p times the frequency."""
+EQUAL = 1e-9
+"""Largest relative difference of a number that is computed again."""
+NOT_COMPUTED = ("seconds", "earlier_seconds", "n_retried", "faults", "question", "version")
+"""What a result has beside what follows from its simulations."""
 FACTOR = "Its contacts are {:.2g} times the nearest end of people's interval (1: inside); nothing was multiplied by it."
 """How the human driver model compares with people."""
 CHECK_TAIL = 0.025
@@ -89,40 +106,8 @@ NOT_COVERED = (
 Status = Literal["supported", "not supported", "not known"]
 
 
-@dataclass(frozen=True)
-class Leaf:
-    """What supports a claim: a value in a file, and the rule by which it does.
-
-    Example:
-        >>> Leaf("result.json", "/doubtful", "equals", False).judge({"doubtful": True})
-        'not supported'
-    """
-
-    file: str
-    """File, relative to the folder of the run."""
-    pointer: str
-    """Place of the value in it, a JSON pointer."""
-    rule: Literal["equals", "at most", "known"]
-    """"equals" and "at most" compare with `limit`; "known" asks for a value at all."""
-    limit: Any = None
-
-    def judge(self, content: Mapping[str, Any]) -> Status:
-        """Return whether the content of the file supports the claim."""
-        value = self.read(content)
-        if value in (None, ""):
-            return "not known"
-        right = value <= self.limit if self.rule == "at most" else self.rule == "known" or value == self.limit
-        return "supported" if right else "not supported"
-
-    def read(self, content: Mapping[str, Any]) -> Any:
-        """Return the value at the pointer; None if there is none."""
-        value: Any = content
-        for part in filter(None, self.pointer.split("/")):
-            try:
-                value = value[int(part)] if isinstance(value, list) else value[part]
-            except (KeyError, IndexError, ValueError, TypeError):
-                return None
-        return value
+KNOWN = "known"
+"""What a leaf wants of a value if it wants one at all."""
 
 
 def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> Status:
@@ -140,27 +125,57 @@ def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> Status:
             ...
         FileNotFoundError: [Errno 2] No such file or directory: 'runs/nowhere/result.json'
     """
-    wanted = Leaf(**{name: leaf[name] for name in ("file", "pointer", "rule", "limit") if name in leaf})
-    status = wanted.judge(_read(folder / wanted.file))
-    files = (wanted.file, f"{EVIDENCE}/test_cases/") if wanted.file.endswith(TEST_CASES) else (wanted.file,)
-    changed = status == "supported" and any(name.startswith(files) for name in find_changed(folder))
-    return "not supported" if changed else status
+    file, value = leaf["file"], read_pointer(_read(folder / leaf["file"]), leaf["pointer"])
+    if value in (None, ""):
+        return "not known"
+    files = (file, f"{EVIDENCE}/test_cases/") if file.endswith(TEST_CASES) else (file,)
+    right = (leaf["rule"] == KNOWN or value == leaf["limit"]) and not find_changed(folder, files)
+    return "supported" if right else "not supported"
 
 
-def find_changed(folder: Path) -> list[str]:
-    """Return the result and files of the evidence, relative to a run's folder, that manifest.json has otherwise."""
-    filed, found = _read(folder / EVIDENCE / MANIFEST).get("sha256") or {}, _digest_files(folder)
-    return sorted(name for name in {**filed, **found} if found.get(name) != filed.get(name))
+def read_pointer(content: Mapping[str, Any], pointer: str) -> Any:
+    """Return the value at a JSON pointer; None if there is none.
+
+    Example:
+        >>> read_pointer({"sources": [{"limited": True}]}, "/sources/0/limited")
+        True
+    """
+    value: Any = content
+    for part in filter(None, pointer.split("/")):
+        try:
+            value = value[int(part)] if isinstance(value, list) else value[part]
+        except (KeyError, IndexError, ValueError, TypeError):
+            return None
+    return value
 
 
-def _digest_files(folder: Path) -> dict[str, str]:
-    """Return SHA-256 digests of the result of a run and of its evidence, but for the manifest that they stand in."""
-    digests = {}
-    for path in (folder / RESULT, *sorted((folder / EVIDENCE).rglob("*"))):
-        if path.is_file() and path.name != MANIFEST:
+def find_changed(folder: Path, files: tuple[str, ...] = ("",)) -> list[str]:
+    """Return the files of a run, a risk and their evidence that manifest.json has otherwise.
+
+    They are relative to the folder; `files` are the beginnings of those that are looked at.
+    """
+    filed, found = _read(folder / EVIDENCE / MANIFEST).get("sha256") or {}, _digest_files(folder, files)
+    names = {name for name in (*filed, *found) if name.startswith(files)}
+    return sorted(name for name in names if found.get(name) != filed.get(name))
+
+
+def _digest_files(folder: Path, files: tuple[str, ...] = ("",)) -> dict[str, str]:
+    """Return SHA-256 digests of the results of a run, or of a risk and its runs, and of the evidence in its folder."""
+    digests, own = dict[str, str](), folder / EVIDENCE / MANIFEST
+    results = [each / name for each in (folder, *_list_runs(folder)) for name in (RISK, STUDY, *DIGESTED)]
+    filed = [path for each in (folder, *_list_runs(folder)) for path in (each / EVIDENCE).rglob("*")]
+    for path in sorted((*results, *filed)):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and path != own and name.startswith(files):
             with open_ordinary(path) as file:
-                digests[path.relative_to(folder).as_posix()] = hashlib.sha256(file.read()).hexdigest()
+                digests[name] = hashlib.sha256(file.read()).hexdigest()
     return digests
+
+
+def _list_runs(folder: Path) -> list[Path]:
+    """Return the folders of the runs of a risk; none if it is none."""
+    names = _read(folder / RISK).get("scenarios") or () if (folder / RISK).is_file() else ()
+    return [folder / str(name) for name in names]
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -169,64 +184,161 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
-    """Write the evidence of a finished run, or of each run of a risk, into its folder.
+    """Write the evidence of a finished run into its folder; of a risk, that of each run and that of the sum.
 
     Args:
         folder: Of `rare-envs estimate --out` or `rare-envs risk --out`.
         trust: Whether code that a folder from elsewhere names may run.
 
     Returns:
-        The files written, the page of each run before its others. Those of an earlier call are replaced.
+        The files written, the page of each run before its others, those of a sum last. Those of an earlier call are
+        replaced.
 
     Raises:
         BadInput: There is no finished run, it may not be driven again, or a file cannot be written.
     """
-    if (folder / RISK).is_file():
-        with as_bad_input(OSError, ValueError):
-            names = _read(folder / RISK).get("scenarios") or ()
-        return tuple(path for name in names for path in _write_evidence_of_run(folder / str(name), trust))
-    return _write_evidence_of_run(folder, trust)
+    if (folder / COMPARISON).is_file():
+        raise BadInput(
+            f"Expected the folder of rare-envs estimate or risk, got that of a comparison, {str(folder)!r}, whose runs "
+            "keep no simulations: evidence is of one ego, from its own rare-envs risk EGO --out FOLDER."
+        )
+    if not (folder / RISK).is_file():
+        return _write_evidence_of_run(folder, trust)[1]
+    with as_bad_input(OSError, ValueError):
+        runs, recorded = _list_runs(folder), _read(folder / RISK)
+        filed = find_changed(folder) if (folder / EVIDENCE / MANIFEST).is_file() else []
+    found = {part.name: _write_evidence_of_run(part, trust) for part in runs}
+    reports, out = {name: report for name, (report, _) in found.items()}, folder / EVIDENCE
+    with output_folder(out, PAGE, *FILES), as_bad_input(OSError, ValueError, KeyError, TypeError):
+        remove_evidence(folder)
+        content = describe_sum(folder, recorded, reports, filed)
+        _finish(folder, recorded["ego"], content, build_claims_of_sum(recorded), recorded["text"])
+    pages = (out / PAGE, *(out / name for name in (*content, CLAIMS, MANIFEST, PICTURE, SCHEMA_FILE)))
+    return (*(path for _, files in found.values() for path in files), *pages)
 
 
-def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Path, ...]:
-    """Write the evidence of one run and return its files."""
+def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Report | str, tuple[Path, ...]]:
+    """Write the evidence of one run; return its report, or why that cannot be computed again, and the files."""
     study = load_finished(folder)
     prepared = prepare(open_run(study, trust))
     out = folder / EVIDENCE
     with output_folder(out, PAGE, *FILES, folders=("test_cases",)), as_bad_input(OSError, ValueError):
         filed = find_changed(folder) if (out / MANIFEST).is_file() else []
         remove_evidence(folder)
-        rows = list_failures(study)
-        drives = [drive_again(prepared.problem, read_row(study.failures, prepared.problem, row)) for row in rows]
+        rows, report = list_failures(study), compute_again(study, prepared)
+        x = [read_row(study.failures, prepared.problem, row) for row in rows]
+        drives = [drive_again(prepared.problem, each) for each in x]
         content: dict[str, dict[str, Any]] = {
             COVERAGE: describe_coverage(prepared),
             UNCERTAINTY: list_uncertainty(study.result),
-            VALIDATION: validate(study, prepared, rows, drives, filed),
+            VALIDATION: validate(study, prepared, drives, report, filed),
             TRAFFIC: describe_traffic_model(prepared),
             TEST_CASES: write_test_cases(out, study, prepared, rows, drives),
-            MANIFEST: describe_origin(study),
+            ORIGIN: describe_origin(study.about),
         }
-        for name, value in content.items():
-            replace_text(out / name, format_json(to_json_value(value)))
-        _seal(folder, content[MANIFEST])
-        content[CLAIMS] = judge_claims(folder, build_claims(study.result))
-        replace_text(out / CLAIMS, format_json(content[CLAIMS]))
-        replace_text(out / PICTURE, draw_claims(content[CLAIMS]["nodes"]))
-        replace_text(out / SCHEMA_FILE, format_json(SCHEMA))
-        replace_text(out / PAGE, render(study, content, (out / PICTURE).read_text(encoding="utf-8")))
-        _seal(folder, content[MANIFEST])
+        question = study.question
+        title = f"{question['ego']} in {question['env_id']}"
+        _finish(folder, title, content, build_claims(study.result), study.result.get("text") or [])
     cases = [out / name for case in content[TEST_CASES]["cases"] for name in case["files"]]
-    return (out / PAGE, *(out / name for name in (*FILES, PICTURE, SCHEMA_FILE)), *cases)
+    return report, (out / PAGE, *(out / name for name in (*FILES, MANIFEST, PICTURE, SCHEMA_FILE)), *cases)
+
+
+def _finish(
+    folder: Path,
+    title: str,
+    content: dict[str, dict[str, Any]],
+    nodes: Sequence[Mapping[str, Any]],
+    answer: Sequence[str],
+) -> None:
+    """Write the files of the evidence in a folder, its claims, judged by them, and its page."""
+    out = folder / EVIDENCE
+    for name, value in content.items():
+        replace_text(out / name, format_json(to_json_value(value)))
+    _seal(folder)
+    content[CLAIMS] = judge_claims(folder, nodes)
+    replace_text(out / CLAIMS, format_json(content[CLAIMS]))
+    replace_text(out / PICTURE, draw_claims(content[CLAIMS]["nodes"]))
+    replace_text(out / SCHEMA_FILE, format_json(SCHEMA))
+    replace_text(out / PAGE, render(title, answer, content, (out / PICTURE).read_text(encoding="utf-8")))
+    _seal(folder)
+
+
+def _seal(folder: Path) -> None:
+    """Write the manifest with the digests of all files as they are now."""
+    replace_text(folder / EVIDENCE / MANIFEST, format_json({"sha256": _digest_files(folder)}))
+
+
+def digest_manifest(files: Sequence[Path]) -> tuple[str, str]:
+    """Return the manifest among evidence files that has digests of all, and its own, which is to be kept elsewhere."""
+    path = next(path for path in reversed(files) if path.name == MANIFEST)
+    return str(path), hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def list_changes(files: Sequence[Path]) -> list[str]:
-    """Return the files of runs, or of earlier evidence, that evidence files found to be changed."""
-    return [name for path in files if path.name == VALIDATION for name in _read(path)["changed"]]
+    """Return the files of a run or a risk, or of earlier evidence, that evidence files found to be changed."""
+    return list(_read(next(path for path in reversed(files) if path.name == VALIDATION))["changed"])
 
 
-def _seal(folder: Path, origin: Mapping[str, Any]) -> None:
-    """Write the manifest with the digests of the other files of the evidence as they are now."""
-    replace_text(folder / EVIDENCE / MANIFEST, format_json(to_json_value({**origin, "sha256": _digest_files(folder)})))
+class _Recorded:
+    """The problem of a run, whose f are those that it has recorded."""
+
+    def __init__(self, problem: Any, study: LoadedStudy) -> None:
+        table = study.episodes([*name_columns(problem.space), "f"])
+        keys, f = digest_scenarios(read_scenarios(table, problem.space)), table["f"].to_numpy()
+        self._problem, self._f = problem, dict(zip(keys, f.tolist(), strict=True))
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the problem has."""
+        return getattr(self._problem, name)
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        """Return f (n,) of scenarios x (n, d) of the run."""
+        try:
+            return np.array([self._f[key] for key in digest_scenarios(x)], dtype=np.float64)
+        except KeyError:
+            raise EvaluationError("the method asks for simulations that the run does not have") from None
+
+
+def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
+    """Return the report that the method gives with the simulations of a run, or why there is none.
+
+    Nothing is simulated but failures, for what they are like. Another processor or version of a library may round
+    otherwise, so that a method goes another way, and asks for other simulations.
+    """
+    if not study.episodes_path.is_file():
+        return f"there is no {study.episodes_path.name}"
+    if study.result.get("version") != __version__:
+        return f"the run is of version {study.result.get('version')}, this is {__version__}"
+    try:
+        problem: Any = _Recorded(prepared.problem, study)
+        report = run(replace(prepared, problem=problem, ego_was_given=True))
+    except BadInput as error:
+        return str(error)
+    again = study.result.get("repeatability")
+    return replace(report, repeatability=again and Repeatability(**{**again, "largest": again["largest"] or np.inf}))
+
+
+def list_differences(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
+    """Return what of a recorded result is not what was computed again, by name."""
+    found = json.loads(format_json(to_json_value(again)))
+    return [name for name in found if name not in NOT_COMPUTED and not _agree(recorded.get(name), found[name])]
+
+
+def _agree(a: Any, b: Any) -> bool:
+    """Return whether values of JSON are equal, numbers up to rounding."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_agree(a[name], b[name]) for name in a)
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(_agree, a, b))
+    if isinstance(a, float) and isinstance(b, int | float):
+        return math.isclose(a, b, rel_tol=EQUAL)
+    return bool(a == b)
+
+
+def _describe_again(file: str, differing: list[str] | None, reason: str) -> dict[str, Any]:
+    """Return what was found by computing a result again."""
+    what = f"{file} computed again by the method from the simulations recorded"
+    return {"what": what, "differing": differing, "reason": reason}
 
 
 def list_failures(study: LoadedStudy) -> list[int]:
@@ -333,51 +445,36 @@ def _source(name: str, what: str, interval: Sequence[float | None], pointer: str
 
 
 def validate(
-    study: LoadedStudy, prepared: Study, rows: Sequence[int], drives: Sequence[Drive], changed: Sequence[str] = ()
+    study: LoadedStudy,
+    prepared: Study,
+    drives: Sequence[Drive],
+    again: Report | str,
+    filed: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return checks of the tool chain: failures driven again, simulators compared, sums, doubts, files changed."""
-    recorded = np.array([study.failures["f"][row] for row in rows])
-    found = np.array([drive.f for drive in drives])
-    sums, result = check_sums(study), study.result
-    forged = [f"{RESULT} (p or the rate does not follow from {study.episodes_path.name})"] if sums["differ"] else []
+    """Return checks of the tool chain: failures driven and the result computed again, simulators, doubts, changes."""
+    rows, result = list_failures(study), study.result
+    recorded, found = study.failures["f"][rows], np.array([drive.f for drive in drives])
+    differing = None if isinstance(again, str) else list_differences(result, report_as_json(again))
     few = [f"{name}: too few failures found" for name in _list_unresolved(result)]
     traffic = [f"traffic model: {text}" for text in (result.get("base_uncertainty") or {}).get("warnings") or []]
     warnings = [*(result.get("doubts") or []), *(result.get("warnings") or []), *traffic, *few]
-    differing = int(np.sum(~(np.abs(found - recorded) <= REPLAY_TOLERANCE)))
+    apart = int(np.sum(~(np.abs(found - recorded) <= REPLAY_TOLERANCE)))
+    forged = [f"{RESULT} ({', '.join(differing)})"] if differing else []
     return {
         "replays": {
             "what": "failures of the run, driven again one by one with every moment kept",
             "compared": len(rows),
-            "differing": differing if len(rows) else None,
+            "differing": apart if len(rows) else None,
             "without_answer_of_the_ego": int(np.isnan(study.failures["f"]).sum()),
             "largest_difference_of_f": float(np.abs(found - recorded).max()) if len(rows) else None,
             "tolerance": REPLAY_TOLERANCE,
         },
         "simulators": compare_simulators(prepared, [read_row(study.failures, prepared.problem, row) for row in rows]),
-        "sums": sums,
+        "computed_again": _describe_again(RESULT, differing, again if isinstance(again, str) else ""),
         "warnings": list(dict.fromkeys(warnings)),
         "files_changed": study.changed_files if study.about.get("results") else None,
-        "changed": [*study.changed_files, *forged, *changed],
+        "changed": list(dict.fromkeys([*study.changed_files, *forged, *filed])),
     }
-
-
-def check_sums(study: LoadedStudy) -> dict[str, Any]:
-    """Return the relative difference of p from the sum of weights, or of the rate from p times frequency if larger.
-
-    None without weights, as of methods of Markov chains (ss, adss).
-    """
-    result, total = study.result, None
-    methods = [(result.get("method") or {}).get("name"), *(part["method"] for part in result.get("parts") or [])]
-    if study.episodes_path.is_file() and not {"ss", "adss"} & set(", ".join(map(str, methods)).split(", ")):
-        weights = study.episodes(["log_weight"], failed=True)["log_weight"].drop_null().to_numpy()
-        total = float(np.exp(weights).sum()) if len(weights) or study.p == 0 else None
-    pairs = [] if total is None else [(study.p, total)]
-    if rate := result.get("rate"):
-        count = rate["frequency"]
-        pairs.append((rate["per_million_km"], 1e6 * count["count"] / count["km"] * count["share"] * study.p))
-    largest = max((abs(a - b) / max(abs(a), abs(b), 1e-300) for a, b in pairs), default=0.0)
-    differ = largest > SUM_TOLERANCE
-    return {"sum": total, "difference": None if total is None and not differ else largest, "differ": differ}
 
 
 def compare_simulators(study: Study, failures: Sequence[FloatArray]) -> dict[str, Any]:
@@ -436,7 +533,8 @@ def write_test_cases(
     ]
     listed = {case["failure"] for case in cases}
     return {
-        "about": "fields after ISO 34505: objective, scenario, initial conditions, expected and actual result",
+        "about": "fields after ISO 34505: objective, scenario, initial conditions, expected and actual result; the ego "
+        "of NN.xosc is free, for the system under test, the others move as they did; in NN_recorded.xosc it does too",
         "cases": cases,
         "modes_without_case": sum(row not in listed for row in modes) if modes else None,
     }
@@ -454,15 +552,17 @@ def _write_case(
     """Write the files of a test case and return its fields."""
     question, space = prepared.question, prepared.problem.space
     name = f"{Path(study.folder).resolve().name}-{number:02d}"
-    files = export_drive(drive, out / "test_cases" / f"{number:02d}.xosc", properties={"f": repr(drive.f)})
+    about, place = {"f": repr(drive.f)}, out / "test_cases" / f"{number:02d}.xosc"
+    x = read_row(study.failures, prepared.problem, row)
+    files = export_drive(drive_again(prepared.problem, x, beyond=True), place, ego="free", properties=about)
+    files += export_drive(drive, place.with_stem(f"{place.stem}_recorded"), properties=about)
     crash = study.failures["crash"][row] if "crash" in study.failures else ""
-    values = {key: value for key, value in space.named(read_row(study.failures, prepared.problem, row)).items()}
     return {
         "id": name,
         "objective": f"The ego passes this scenario without {question.measure} <= {question.gamma:g}.",
         "scenario_category": prepared.problem.world.scenario.name,
         "test_environment": {"simulator": study.about.get("versions"), "scenario": question.env_id},
-        "parameters": {key: value for key, value in values.items() if np.size(value) == 1},
+        "parameters": {key: value for key, value in space.named(x).items() if np.size(value) == 1},
         "units": dict(zip(space.names, space.units, strict=True)),
         "initial_conditions": {
             "vehicles": list(drive.names),
@@ -479,69 +579,149 @@ def _write_case(
     }
 
 
-def describe_origin(study: LoadedStudy) -> dict[str, Any]:
-    """Return what made the run and how to make it again: command, seeds, versions, digests."""
-    about = study.about
-    names = sorted(path.name for path in study.folder.iterdir() if path.is_file())
+def describe_origin(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what made a run and how to make it again: command, seeds, versions, files of its ego, by study.json."""
+    names = ("command", "begun", "finished", "seed", "ego", "base", "versions", "files")
+    return {name: about.get(name) for name in names}
+
+
+def describe_sum(
+    folder: Path, recorded: Mapping[str, Any], reports: Mapping[str, Report | str], filed: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Return the files of the evidence of a risk by name, from risk.json, and the evidence and reports of its runs."""
+    parts = {name: {key: _read(folder / name / EVIDENCE / key) for key in FILES} for name in reports}
+    coverage, uncertainty, validation, origin = (
+        {name: part[key] for name, part in parts.items()} for key in (COVERAGE, UNCERTAINTY, VALIDATION, ORIGIN)
+    )
+    cells = [cell for each in coverage.values() for cell in each["iso_34502"]["covered"]]
+    differing, reason = add_again(recorded, reports)
+    forged = [f"{RISK} ({', '.join(differing)})"] if differing else []
+    changed = [f"{name}/{file}" for name, each in validation.items() for file in each["changed"]]
+    whole = recorded["per_million_km"]
+    rates = [
+        {
+            "scenario": name,
+            **{key: each[key] for key in ("per_million_km", "interval_per_million_km")},
+            "share_of_sum": each["per_million_km"] / whole if whole else None,
+            "limited": uncertainty[name]["sources"][2]["limited"],
+            "file": RISK,
+            "pointer": f"/scenarios/{name}/interval_per_million_km",
+        }
+        for name, each in recorded["scenarios"].items()
+    ]
+    limited, first = [rate["limited"] for rate in rates], next(iter(parts.values()))
     return {
-        "command": about.get("command"),
-        **{name: about.get(name) for name in ("begun", "finished", "seed", "ego", "base", "versions", "files")},
-        "blake2b": {name: digest_file(study.folder / name) for name in names},
+        COVERAGE: {
+            **{key: first[COVERAGE][key] for key in ("statement", "also_not_covered", "counted")},
+            "scenarios": {name: f"{name}/{EVIDENCE}/{COVERAGE}" for name in parts},
+            "iso_34502": {"covered": cells, "not_covered": [cell for cell in CELLS if cell not in cells]},
+            "left_out": recorded["left_out"],
+        },
+        UNCERTAINTY: {
+            **{key: recorded[key] for key in ("per_million_km", "interval_per_million_km", "confidence")},
+            "rates": rates,
+            "limited": None if None in limited else all(limited),
+            "shares_of_variance": recorded["shares_of_variance"],
+            "calibration": [one for each in uncertainty.values() for one in each["calibration"]],
+            "left_out": first[UNCERTAINTY]["left_out"],
+        },
+        VALIDATION: {
+            "computed_again": _describe_again(RISK, differing, reason),
+            "warnings": recorded["warnings"],
+            "changed": list(dict.fromkeys([*forged, *changed, *filed])),
+        },
+        ORIGIN: {**first[ORIGIN], "base": {name: each["base"] for name, each in origin.items()}},
     }
+
+
+def add_again(recorded: Mapping[str, Any], reports: Mapping[str, Report | str]) -> tuple[list[str] | None, str]:
+    """Return what of risk.json is not the sum of the reports of its runs, by name; or None, and why it is not known.
+
+    The spread between sites is taken as recorded.
+    """
+    done, kept = list[ScenarioRisk](), {name: dict(part) for name, part in recorded["scenarios"].items()}
+    for name, report in reports.items():
+        if isinstance(report, str) or report.rate is None:
+            return None, f"{name_scenario(name)}: {report if isinstance(report, str) else report.no_rate}"
+        rate = replace(report.rate, site_log_sd=kept[name]["site_log_sd"])
+        done.append(ScenarioRisk(report=report, rate=rate, site_factors=kept[name]["site_factors"]))
+    again = Risk(ego=recorded["ego"], scenarios=tuple(done), left_out=recorded["left_out"]).to_dict()
+    for part in (*kept.values(), *again["scenarios"].values()):
+        part.pop("report", None)  # which its own evidence compares
+    return list_differences({**recorded, "scenarios": kept}, again), ""
+
+
+Goals = dict[str, list[tuple[str, str, str, Any]]]
+"""By strategy its claims: text, file, pointer into it, and the value there that supports it, or `KNOWN`."""
 
 
 def build_claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the nodes of the claim tree of a run, parents first."""
-    gate = result.get("gate")
-    evidence = f"{EVIDENCE}/"
-    events = result.get("events") or []
-    goals: dict[str, list[tuple[str, Leaf]]] = {
-        "S1 Argue over each source of uncertainty": [
-            *([("The limit is met", Leaf(RESULT, "/gate/decision", "equals", "passes"))] if gate else []),
-            (
-                f"Enough simulations in each part of the traffic: relative error of p at most {ENOUGH_COV:g}",
-                Leaf(evidence + UNCERTAINTY, "/simulations/enough", "equals", True),
-            ),
-            ("Recorded events limit p", Leaf(evidence + UNCERTAINTY, "/sources/2/limited", "equals", True)),
-            *[
-                (
-                    f"A human driver model is within a factor 3 of people's interval ({each['event']})",
-                    Leaf(evidence + UNCERTAINTY, f"/calibration/{number}/calibrated", "equals", True),
-                )
-                for number, each in enumerate(events)
-            ],
-        ],
-        "S2 Argue over the tool chain": [
-            ("Failures replay", Leaf(evidence + VALIDATION, "/replays/differing", "equals", 0)),
-            (
-                "Two implementations of one model agree",
-                Leaf(evidence + VALIDATION, "/simulators/failures_differing", "equals", 0),
-            ),
-            ("The traffic model expects what was recorded", Leaf(evidence + TRAFFIC, "/checks_outside", "equals", 0)),
-            ("The run has no warning", Leaf(evidence + VALIDATION, "/warnings", "equals", [])),
-        ],
-        "S3 Argue over what is filed": [
-            (
-                "p is the sum of the weights of the failing episodes, and the rate p times their frequency",
-                Leaf(evidence + VALIDATION, "/sums/difference", "at most", SUM_TOLERANCE),
-            ),
-            ("Each crash mode has a test case", Leaf(evidence + TEST_CASES, "/modes_without_case", "equals", 0)),
-            ("The run can be made again", Leaf(evidence + MANIFEST, "/command", "known")),
-            ("The files are those that the run wrote", Leaf(evidence + VALIDATION, "/files_changed", "equals", [])),
-        ],
-    }
+    few = f"Enough simulations in each part of the traffic: relative error of p at most {ENOUGH_COV:g}"
+    people = "A human driver model is within a factor 3 of people's interval"
+    events, goals = enumerate(result.get("events") or []), Goals()
+    goals["S1 Argue over each source of uncertainty"] = [
+        *([("The limit is met", RESULT, "/gate/decision", "passes")] if result.get("gate") else []),
+        (few, UNCERTAINTY, "/simulations/enough", True),
+        ("Recorded events limit p", UNCERTAINTY, "/sources/2/limited", True),
+        *((f"{people} ({one['event']})", UNCERTAINTY, f"/calibration/{n}/calibrated", True) for n, one in events),
+    ]
+    goals["S2 Argue over the tool chain"] = [
+        ("Failures replay", VALIDATION, "/replays/differing", 0),
+        ("Two implementations of one model agree", VALIDATION, "/simulators/failures_differing", 0),
+        ("The traffic model expects what was recorded", TRAFFIC, "/checks_outside", 0),
+        ("The run has no warning", VALIDATION, "/warnings", []),
+    ]
+    goals["S3 Argue over what is filed"] = [
+        ("The result is what its method makes of its simulations", VALIDATION, "/computed_again/differing", []),
+        ("Each crash mode has a test case", TEST_CASES, "/modes_without_case", 0),
+        ("The run can be made again", ORIGIN, "/command", KNOWN),
+        ("The files are those that the run wrote", VALIDATION, "/files_changed", []),
+    ]
+    return _list_nodes(_describe_limit(result), goals)
+
+
+def build_claims_of_sum(result: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the nodes of the claim tree of a risk, a sum over scenarios, whose runs have trees of their own."""
+    goals, gate, limit = Goals(), result["gate"], "Upper limit {} collisions per million km".format
+    goals["S1 Argue over each scenario, by the claims of its run"] = [
+        (
+            f"{limit(format_rate(part['interval_per_million_km'][1]))} in {name_scenario(name)}",
+            *(f"{name}/{EVIDENCE}/{CLAIMS}", "/nodes/0/status", "supported"),
+        )
+        for name, part in result["scenarios"].items()
+    ]
+    goals["S2 Argue over the sum"] = [
+        *([("The limit is met", RISK, "/gate/decision", "passes")] if gate else []),
+        ("No scenario that was asked for is left out", RISK, "/left_out", {}),
+        ("Recorded events limit each rate", UNCERTAINTY, "/limited", True),
+        ("The sum is that of its runs", VALIDATION, "/computed_again/differing", []),
+        ("The files are those that were filed", VALIDATION, "/changed", []),
+        ("The risk can be made again", ORIGIN, "/command", KNOWN),
+    ]
+    about = f"{result['ego']} in {' and '.join(map(name_scenario, result['scenarios']))}"
+    about += f", {100 * result['confidence']:g} %"
+    whole = limit(format_rate(result["interval_per_million_km"][1]))
+    return _list_nodes(f"{whole}; {_describe_gate(gate)} ({about})", goals)
+
+
+def _list_nodes(top: str, goals: Goals) -> list[dict[str, Any]]:
+    """Return the nodes of a tree: the top claim, its context, and by strategy its claims, each with its leaf."""
     nodes: list[dict[str, Any]] = [
-        {"id": "G1", "kind": "goal", "text": _describe_limit(result), "supports": None},
-        {"id": "C1", "kind": "context", "text": f"Covered: {evidence}{COVERAGE}", "supports": "G1"},
+        {"id": "G1", "kind": "goal", "text": top, "supports": None},
+        {"id": "C1", "kind": "context", "text": f"Covered: {EVIDENCE}/{COVERAGE}", "supports": "G1"},
         {"id": "A1", "kind": "assumption", "text": "The family of the traffic model is right", "supports": "G1"},
     ]
     for strategy, below in goals.items():
         own, _, words = strategy.partition(" ")
         nodes.append({"id": own, "kind": "strategy", "text": words, "supports": "G1"})
-        for claim, leaf in below:
+        for claim, name, pointer, limit in below:
             number = sum(node["kind"] == "goal" for node in nodes) + 1
             nodes.append({"id": f"G{number}", "kind": "goal", "text": claim, "supports": own})
-            nodes.append({"id": f"Sn{number}", "kind": "solution", "supports": f"G{number}", **_name_leaf(leaf)})
+            file, rule = f"{EVIDENCE}/{name}" if name in FILES else name, KNOWN if limit is KNOWN else "equals"
+            text = f"{file} {pointer}: {rule}" + ("" if limit is KNOWN else f" {limit!r}")
+            leaf = {"file": file, "pointer": pointer, "rule": rule, "limit": None if limit is KNOWN else limit}
+            nodes.append({"id": f"Sn{number}", "kind": "solution", "supports": f"G{number}", "text": text, **leaf})
     return nodes
 
 
@@ -556,17 +736,14 @@ def _describe_limit(result: Mapping[str, Any]) -> str:
         limit = f"Upper limit {format_rate(rate['interval_per_million_km'][1])} per million km"
     if high >= 1:
         limit = "No upper limit"
-    gate = result.get("gate")
-    decision = "no acceptance limit was set"
-    if gate:
-        decision = f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}"
-    return f"{limit}; {decision} ({ego} in {env_id}, {level})"
+    return f"{limit}; {_describe_gate(result.get('gate'))} ({ego} in {env_id}, {level})"
 
 
-def _name_leaf(leaf: Leaf) -> dict[str, Any]:
-    """Return a leaf as JSON has it."""
-    rule = leaf.rule if leaf.rule == "known" else f"{leaf.rule} {leaf.limit!r}"
-    return {"text": f"{leaf.file} {leaf.pointer}: {rule}", **to_json_value(asdict(leaf))}
+def _describe_gate(gate: Mapping[str, Any] | None) -> str:
+    """Return what was decided of a limit."""
+    if not gate:
+        return "no acceptance limit was set"
+    return f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}"
 
 
 def _find_upper_limit(result: Mapping[str, Any]) -> float:
@@ -635,14 +812,14 @@ def _draw_node(axes: Any, node: Mapping[str, Any], x: float, y: float, width: fl
     )
 
 
-def render(study: LoadedStudy, content: Mapping[str, Any], picture: str) -> str:
+def render(title: str, answer: Sequence[str], content: Mapping[str, Any], picture: str) -> str:
     """Return the page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rare_envs.study.html_report"), autoescape=True, trim_blocks=True
     )
     page = environment.get_template("evidence.html.j2").render(
-        result=study.result,
-        question=study.question,
+        title=title,
+        answer=answer,
         disclaimer=DISCLAIMER,
         picture=Markup(picture[picture.index("<svg") :]),  # of this program, its texts escaped
         **{name.removesuffix(".json"): value for name, value in content.items()},

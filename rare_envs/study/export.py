@@ -78,9 +78,9 @@ def export_scenario(
     row = problem.space.validate(np.atleast_2d(np.asarray(x, dtype=np.float64)))
     if len(row) != 1:
         raise ValueError(f"Expected one scenario of shape ({problem.dim},), got {len(row)}.")
-    check_export(path, format, ego)
+    free = check_export(path, format, ego)
     named = {name: value for name, value in problem.space.named(row[0]).items() if np.size(value) == 1}
-    drive = drive_again(problem, row[0])
+    drive = drive_again(problem, row[0], beyond=free)
     properties = {"f": repr(drive.f), **{name: repr(float(value)) for name, value in named.items()}}
     return export_drive(drive, path, format, ego, properties)
 

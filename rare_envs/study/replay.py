@@ -118,12 +118,13 @@ class Drive:
 
 
 @torch.inference_mode()
-def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
+def drive_again(problem: DrivingProblem, x: NDArray[np.float64], beyond: bool = False) -> Drive:
     """Drive one scenario and keep every moment up to the collision or the horizon.
 
     Args:
         problem: The world and its ego.
         x: Scenario parameters, shape (d,).
+        beyond: Go on to the horizon after a collision, for what the other vehicles would have done.
 
     Returns:
         The drive, made on the CPU; its f is that of `problem.evaluate`, but for rounding where that is on a GPU.
@@ -140,7 +141,7 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
     rows = torch.from_numpy(x).float()[None]
     for episode in drive(world.with_statistics(), driver, rows):
         episodes.append(episode)
-        if bool(episode.collided):
+        if bool(episode.collided) and not beyond:
             break
     episodes[-1] = problem.settle(episodes[-1], rows.to(problem.device))
     return Drive(problem, tuple(episodes))

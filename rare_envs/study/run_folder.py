@@ -55,7 +55,7 @@ FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """The same as of failures for scenarios on which the ego failed."""
 EVIDENCE = "evidence"
 """Folder of what `rare_envs.study.evidence` writes."""
-EVIDENCE_FILES = ("*.json", "claims.svg", "evidence.html", "test_cases/[0-9][0-9].xo*")
+EVIDENCE_FILES = ("*.json", "claims.svg", "evidence.html", "test_cases/[0-9][0-9]*.xo*")
 """Its files, as patterns."""
 DIGESTED = (RESULT, FAILURES, BLOCKS, FAULTS, FAULT_BLOCKS, EPISODES)
 """Files that hold numbers of a run; pictures follow from them."""

@@ -227,7 +227,7 @@ class Exceedance(Curve):
                 low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
                 label = f"base distribution, {100 * self.base.confidence:g} % of all together"
                 axes.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)
-            axes.legend(frameon=False)
+            axes.legend(loc="lower right", frameon=False)
         return axes
 
 

@@ -200,17 +200,22 @@ def report_command(
     force: ForceOption = False,
 ) -> Answer:
     """Write the report of a run, a risk or a comparison as one HTML file, with films of its failures."""
-    from rare_envs.study.evidence import list_changes, write_evidence
+    from rare_envs.study.evidence import digest_manifest, list_changes, write_evidence
     from rare_envs.study.html_report import write_html_report
+    from rare_envs.study.run_folder import MOST_NAMED
 
     refuse_existing(force, out, out and out.parent / "figures" if figures else None)
-    page, *drawn = write_html_report(folder, events=events, out=out, figures=figures, **asked)
     files = write_evidence(folder, **asked) if evidence else ()
-    filed, changed = [str(path) for path in files], list_changes(files)
+    page, *drawn = write_html_report(folder, events=events, out=out, figures=figures, **asked)
+    filed, changed = [str(path) for path in files], list_changes(files) if files else []
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
     text += "".join(f"\nWrote {path} and the files beside it." for path in filed if path.endswith(".html"))
-    text += f"\nChanged since they were written: {', '.join(changed)}." if changed else ""
+    more = f" and {len(changed) - MOST_NAMED} more" if len(changed) > MOST_NAMED else ""
+    text += f"\nChanged since they were written: {', '.join(changed[:MOST_NAMED])}{more}." if changed else ""
     data = {"report": str(page), "figures": [str(path) for path in drawn], "evidence": filed, "changed": changed}
+    if files:
+        manifest, data["sha256"] = digest_manifest(files)
+        text += f"\nKeep elsewhere, as it has the digests of all: {manifest}, SHA-256 {data['sha256']}"
     return Answer(data, text, DOUBTFUL if changed else 0)
 
 

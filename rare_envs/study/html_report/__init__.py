@@ -188,7 +188,7 @@ def _draw_drive(drive: Drive, name: str) -> list[FigureOfPage]:
     def draw_measure(figure: Figure) -> None:
         axes = figure.subplots()
         plots.draw_measure(axes, drive)
-        axes.legend(frameon=False)
+        axes.legend(loc="upper right", frameon=False)
 
     def draw_speeds(figure: Figure) -> None:
         plots.draw_speeds(figure.subplots(), drive)

@@ -92,7 +92,7 @@ def draw_band(
     axes.set(yscale="log", xlabel=words[0], ylabel=words[1])
     if gamma is not None:
         axes.axvline(gamma, color=HIT_COLOUR, linewidth=1, label="gamma")
-        axes.legend(frameon=False)
+        axes.legend(loc="lower right", frameon=False)
 
 
 def figures_of_result(result: Result, measure: str, prefix: str = "") -> dict[str, FigureOfPage]:

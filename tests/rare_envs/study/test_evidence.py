@@ -1,10 +1,12 @@
 """Evidence of a run: every claim can be judged again from its file, and says so when the file no longer supports it."""
 
+import hashlib
 import json
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import jsonschema
@@ -13,8 +15,8 @@ from typer.testing import Result
 
 from rare_envs.files import digest_file
 from rare_envs.study import Question, prepare, run_into
-from rare_envs.study.evidence import CELLS, EVIDENCE, FILES, SCHEMA, find_changed, judge_leaf, write_evidence
-from rare_envs.study.run_folder import RESULT, STUDY
+from rare_envs.study.evidence import CELLS, EVIDENCE, SCHEMA, find_changed, judge_leaf, write_evidence
+from rare_envs.study.run_folder import COMPARISON, RESULT, RISK, STUDY
 
 
 def make_run(folder: Path, **settings: object) -> Path:
@@ -41,21 +43,43 @@ def sure(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read(folder: Path) -> dict[str, dict[str, object]]:
-    return {name: json.loads((folder / EVIDENCE / name).read_text(encoding="utf-8")) for name in FILES}
+    paths = [path for path in (folder / EVIDENCE).glob("*.json") if path.name != "evidence.schema.json"]
+    return {path.name: json.loads(path.read_text(encoding="utf-8")) for path in paths}
 
 
-def test_the_files_have_the_fields_of_the_schema(run: Path) -> None:
+def list_leaves(folder: Path) -> list[dict[str, Any]]:
+    nodes: Any = read(folder)["claims.json"]["nodes"]
+    return [node for node in nodes if node["kind"] == "solution"]
+
+
+def test_the_files_have_the_fields_of_the_schema_and_no_others(run: Path) -> None:
     content = read(run)
     jsonschema.validate(content, SCHEMA)
-    with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate({**content, "claims.json": {}}, SCHEMA)
+    for claims in ({}, {**content["claims.json"], "more": 1}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({**content, "claims.json": claims}, SCHEMA)
 
 
 def test_each_leaf_is_judged_again_from_its_file(run: Path) -> None:
-    nodes = read(run)["claims.json"]["nodes"]
-    leaves = [node for node in nodes if node["kind"] == "solution"]  # type: ignore[attr-defined]
+    leaves = list_leaves(run)
     assert len(leaves) >= 10
     assert all(judge_leaf(run, leaf) == leaf["status"] for leaf in leaves)
+
+
+def test_the_result_follows_from_the_simulations_and_says_so_where_it_does_not(
+    run: Path, tmp_path: Path, cli: Callable[..., Result]
+) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    for folder, wanted in ((run, []), (copy, ["p", "interval", "rate"])):
+        if folder == copy:  # p and limits that look better, signed again
+            sign_again(copy, {"p": 1e-8, "interval": [0.0, 1e-7], "rate": {"interval_per_million_km": [0.0, 1e-2]}})  # type: ignore[dict-item]
+            answer = cli("report", copy, "--evidence", "--json")
+            assert answer.exit_code == 3
+            assert f"{RESULT} (p, interval, rate)" in json.loads(answer.stdout)["changed"]
+        found: Any = read(folder)["validation.json"]["computed_again"]
+        assert found["differing"] == wanted
+        status = {leaf["pointer"]: leaf["status"] for leaf in list_leaves(folder)}
+        assert (status["/computed_again/differing"] == "supported") == (not wanted)
 
 
 def test_a_claim_is_supported_where_all_below_it_is(run: Path) -> None:
@@ -76,8 +100,6 @@ def test_a_claim_is_supported_where_all_below_it_is(run: Path) -> None:
         ("/simulations/enough", {"status": "budget"}),
         ("/simulations/enough", {"parts": [{"name": "unseen", "resolved": False, "method": "mc"}]}),
         ("/warnings", {"parts": [{"name": "unseen", "resolved": False, "method": "mc"}]}),
-        ("/sums/difference", {"p": 1e-8}),
-        ("/sums/difference", {"rate": {"per_million_km": 0.1}}),
         ("/gate/decision", {"gate": {"decision": "fails", "limit": 1.0, "quantity": "p"}}),
     ],
 )
@@ -104,28 +126,33 @@ def sign_again(folder: Path, change: dict[str, dict[str, object]]) -> None:
     (folder / STUDY).write_text(json.dumps(about), encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["validation.json", "test_cases/00.xosc"])
-@pytest.mark.parametrize("removed", [True, False])
+@pytest.mark.parametrize(
+    ("name", "removed"), [("origin.json", False), ("validation.json", True), ("test_cases/00.xosc", False)]
+)
 def test_a_changed_file_of_the_evidence_supports_nothing_and_is_named(
     run: Path, tmp_path: Path, cli: Callable[..., Result], name: str, removed: bool
 ) -> None:
     copy = shutil.copytree(run, tmp_path / "copy")
-    path, claims = copy / EVIDENCE / name, read(run)["claims.json"]["nodes"]
+    path, leaves = copy / EVIDENCE / name, list_leaves(run)
     if removed:
         path.unlink()
     else:
         path.write_text(path.read_text(encoding="utf-8") + " ", encoding="utf-8")
     assert find_changed(copy) == [f"{EVIDENCE}/{name}"]
     used = "test_cases.json" if name.startswith("test_cases/") else name
-    for leaf in (each for each in claims if each.get("file") == f"{EVIDENCE}/{used}"):  # type: ignore[attr-defined]
-        if path.suffix == ".json" and removed:
+    for leaf in (each for each in leaves if each["file"] == f"{EVIDENCE}/{used}"):
+        if removed:
             with pytest.raises(FileNotFoundError):
                 judge_leaf(copy, leaf)
         else:
-            assert judge_leaf(copy, leaf) == "not supported"
+            assert judge_leaf(copy, leaf) != "supported"
     assert cli("report", copy, "--evidence").exit_code == 3
     assert f"no evidence: {EVIDENCE}/{name}." in (copy / EVIDENCE / "evidence.html").read_text(encoding="utf-8")
-    assert cli("report", copy, "--evidence").exit_code == 0  # written anew
+    manifest = copy / EVIDENCE / "manifest.json"
+    answer = json.loads(cli("report", copy, "--evidence", "--json").stdout)  # written anew
+    assert answer["changed"] == [] and answer["sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
+    manifest.write_text('{"sha256": {}}', encoding="utf-8")  # a list that lists nothing guards nothing
+    assert {RESULT, f"{EVIDENCE}/{name}"} <= set(find_changed(copy))
 
 
 def test_no_limit_is_claimed_where_there_is_none(run: Path, tmp_path: Path) -> None:
@@ -144,8 +171,12 @@ def test_test_cases_are_the_likeliest_failures_with_a_road_each(run: Path) -> No
     cases = read(run)["test_cases.json"]["cases"]
     assert [case["failure"] for case in cases][:1] == [0]  # type: ignore[attr-defined]
     for case in cases:  # type: ignore[attr-defined]
-        scenario, road = (run / EVIDENCE / name for name in case["files"])
-        assert ET.parse(scenario).getroot().tag == "OpenSCENARIO" and ET.parse(road).getroot().tag == "OpenDRIVE"
+        free, road, recorded, same_road = (ET.parse(run / EVIDENCE / name).getroot() for name in case["files"])
+        assert free.tag == recorded.tag == "OpenSCENARIO" and road.tag == same_road.tag == "OpenDRIVE"
+        driven = [{each.get("entityRef") for each in story.iter("EntityRef")} for story in (free, recorded)]
+        assert driven[1] - driven[0] == {"Ego"}  # the system under test drives it, to the end and not to the crash
+        ends = [max(float(each.get("time", 0)) for each in story.iter("Vertex")) for story in (free, recorded)]
+        assert ends == pytest.approx([10.0, case["actual_result"]["ends_after_s"]])
         speeds = case["initial_conditions"]["speed_m_s"]
         wanted = [case["parameters"][name] for name in ("ego_speed", "cut_in_speed", "lead_speed")]
         assert speeds == pytest.approx(wanted, rel=1e-6) and case["actual_result"]["f"] == -1.0
@@ -176,11 +207,37 @@ def test_the_page_says_what_it_is_not(run: Path) -> None:
     assert "no conformity assessment" in page and "<svg" in page and "us101" in page
 
 
+def test_a_comparison_has_no_evidence_of_its_own(tmp_path: Path, cli: Callable[..., Result]) -> None:
+    (tmp_path / COMPARISON).write_text("{}", encoding="utf-8")
+    answer = cli("report", tmp_path, "--evidence")
+    assert answer.exit_code == 2 and "rare-envs risk EGO --out FOLDER" in answer.stderr.replace("\n", " ")
+
+
 @pytest.mark.slow
-def test_a_report_files_the_evidence_of_each_run_of_a_risk(tmp_path: Path, cli: Callable[..., Result]) -> None:
+def test_a_report_files_the_evidence_of_each_run_of_a_risk_and_of_the_sum(
+    tmp_path: Path, cli: Callable[..., Result]
+) -> None:
     folder = tmp_path / "risk"
-    cli("risk", "idm", "--max-sim", 500, "--out", folder)
+    cli("risk", "idm", "--max-sim", 500, "--max-rate", 1e9, "--out", folder)
     answer = cli("report", folder, "--evidence", "--json")
     assert answer.exit_code == 0, answer.output
     pages = [Path(path) for path in json.loads(answer.stdout)["evidence"] if path.endswith(".html")]
-    assert [page.parent.parent.name for page in pages] == ["cut_in", "hard_brake"]
+    assert [page.parent.parent.name for page in pages] == ["cut_in", "hard_brake", "risk"]
+    content: Any = read(folder)
+    jsonschema.validate(content, SCHEMA)
+    recorded = json.loads((folder / RISK).read_text(encoding="utf-8"))
+    assert content["uncertainty.json"]["interval_per_million_km"] == recorded["interval_per_million_km"]
+    assert content["coverage.json"]["iso_34502"]["covered"] == [f"main roadway, lane keep, {each}" for each in ISO]
+    leaves = {leaf["pointer"]: leaf for leaf in list_leaves(folder)}
+    assert all(judge_leaf(folder, leaf) == leaf["status"] for leaf in leaves.values())
+    assert leaves["/computed_again/differing"]["status"] == leaves["/left_out"]["status"] == "supported"
+    assert leaves["/nodes/0/status"]["status"] == "not supported"  # so few simulations have warnings
+    recorded["interval_per_million_km"][1] = 0.1
+    (folder / RISK).write_text(json.dumps(recorded), encoding="utf-8")
+    assert find_changed(folder) == [RISK]
+    answer = cli("report", folder, "--evidence", "--json")
+    assert answer.exit_code == 3
+    assert json.loads(answer.stdout)["changed"] == [f"{RISK} (interval_per_million_km)", RISK]
+
+
+ISO = ("cut-in", "deceleration")
