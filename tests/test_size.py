@@ -14,7 +14,7 @@ LIMITS = {
     "package lines": 57_650,
     "code lines": 36_625,
     "modules": 213,
-    "functions": 3_225,
+    "functions": 3_220,
     "classes": 472,
     "import lines, percent of code": 10.5,
     "test lines": 33_975,

@@ -22,7 +22,7 @@ from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
-from rare_envs.distributions.coordinates import FloatArray
+from rare_envs.distributions.coordinates import FloatArray, read_rows
 from rare_envs.distributions.mixture import TruncatedGaussianMixture, Walk
 from rare_envs.distributions.space import RELATIVE_CHANGE, DistributionParameter
 from rare_envs.distributions.truncated_normal import solve_rising
@@ -134,7 +134,7 @@ class AcceptedGaps:
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
         """Return the log density, (n, d) -> (n,); -inf outside the box, and if nobody accepts."""
-        points = self.mixture.read_rows("x", x)
+        points = read_rows("x", x, self.dim)
         inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
         z = self._to_closing(points)
         accepted = log_acceptance(z[:, self._gap], z[:, self._speed], self.limit)
@@ -155,7 +155,7 @@ class AcceptedGaps:
         Raises:
             ValueError: Wrong shape, or a point outside the box.
         """
-        z = self._to_closing(self.mixture.read_rows("x", x))
+        z = self._to_closing(read_rows("x", x, self.dim))
         u = np.array(self.mixture.to_standard_normal(z))
         u[:, self._speed] = -self._closing.to_normal(z[:, self._speed], u[:, self._speed])
         for rows in self._closing_rows(z[:, self._speed]):
@@ -171,7 +171,7 @@ class AcceptedGaps:
         Raises:
             ValueError: Wrong shape, or u is not finite.
         """
-        inner, z = np.array(self.mixture.read_rows("u", u)), np.zeros(np.shape(u))
+        inner, z = np.array(read_rows("u", u, self.dim)), np.zeros(np.shape(u))
         speed, gap = -inner[:, self._speed], inner[:, self._gap].copy()
         z[:, self._speed] = self._closing.from_normal(speed)
         walk = Walk(self.mixture, z)

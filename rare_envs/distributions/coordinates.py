@@ -379,6 +379,15 @@ def as_finite(name: str, values: ArrayLike) -> FloatArray:
     return array
 
 
+def read_rows(name: str, points: ArrayLike, dim: int) -> FloatArray:
+    """Return points as float64 (n, d), if they have that shape."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != dim:
+        hint = "; add a batch axis" if array.shape == (dim,) else ""
+        raise ValueError(f"Expected {name} of shape (n, {dim}), got {array.shape}{hint}.")
+    return array
+
+
 def freeze_arrays(owner: object, *names: str) -> None:
     """Make fields of a frozen dataclass finite float64 arrays that cannot be written."""
     for name in names:

@@ -23,6 +23,7 @@ from rare_envs.distributions.coordinates import (
     freeze_arrays,
     move_inside,
     pick_fields,
+    read_rows,
 )
 from rare_envs.distributions.space import (
     RELATIVE_CHANGE,
@@ -70,7 +71,7 @@ class MappedMixture:
         Raises:
             ValueError: Wrong shape, or a point outside the box.
         """
-        points = self.read_rows("x", x)
+        points = read_rows("x", x, self.dim)
         outside = ~self.coordinates.contains(points)
         if outside.any():
             i, j = map(int, np.argwhere(outside)[0])
@@ -90,19 +91,11 @@ class MappedMixture:
         Raises:
             ValueError: Wrong shape, or u is not finite.
         """
-        points = self.read_rows("u", u)
+        points = read_rows("u", u, self.dim)
         if not np.isfinite(points).all():
             i, j = np.argwhere(~np.isfinite(points))[0]
             raise ValueError(f"u[{i}, {j}] = {points[i, j]} must be finite.")
         return self._by_chunks(self._from_normal, points)
-
-    def read_rows(self, name: str, points: ArrayLike) -> FloatArray:
-        """Return points as float64 (n, d), if they have that shape."""
-        array = np.asarray(points, dtype=np.float64)
-        if array.ndim != 2 or array.shape[1] != self.dim:
-            hint = "; add a batch axis" if array.shape == (self.dim,) else ""
-            raise ValueError(f"Expected {name} of shape (n, {self.dim}), got {array.shape}{hint}.")
-        return array
 
     def _by_chunks(self, function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
         """Return a function of rows, computed for some rows at a time."""
@@ -276,7 +269,7 @@ class TruncatedGaussianMixture(MappedMixture):
         Raises:
             ValueError: Wrong shape.
         """
-        points = self.read_rows("x", x)
+        points = read_rows("x", x, self.dim)
         inside = self.coordinates.contains(points).all(axis=1)
         out = np.full(len(points), -np.inf)
         out[inside] = self._by_chunks(self._log_density, self.coordinates.interior(points[inside]))

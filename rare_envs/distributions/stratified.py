@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr, ndtri_exp
 
 from rare_envs.distributions.acceptance import AcceptedGaps
-from rare_envs.distributions.coordinates import FloatArray, freeze_arrays, move_inside
+from rare_envs.distributions.coordinates import FloatArray, freeze_arrays, move_inside, read_rows
 from rare_envs.distributions.mixture import TruncatedGaussianMixture
 from rare_envs.distributions.product import ProductDistribution, box_of, change_parts
 from rare_envs.distributions.space import RELATIVE_CHANGE, Distribution, DistributionParameter
@@ -161,7 +161,7 @@ class StratifiedDistribution:
 
     def log_prob(self, x: ArrayLike) -> FloatArray:
         """Return the log density, (n, d) -> (n,); -inf outside the strata."""
-        points = self._read("x", x)
+        points = read_rows("x", x, self.dim)
         out = np.empty(len(points))
         for rows, stratum, _ in self._split(points):
             out[rows] = stratum.base.log_prob(points[rows]) + np.log(stratum.share)
@@ -173,7 +173,7 @@ class StratifiedDistribution:
 
     def to_standard_normal(self, x: ArrayLike) -> FloatArray:
         """Map points in the strata to standard normal space, (n, d) -> (n, d), with both tails precise."""
-        points = self._read("x", x)
+        points = read_rows("x", x, self.dim)
         u = np.empty(points.shape)
         for rows, stratum, (below, above) in self._split(points):
             own = np.array(stratum.base.to_standard_normal(points[rows]))
@@ -185,7 +185,7 @@ class StratifiedDistribution:
 
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
         """Map from standard normal space, (n, d) -> (n, d)."""
-        points = self._read("u", u)
+        points = read_rows("u", u, self.dim)
         x, v = np.empty(points.shape), points[:, self.column]
         lower, upper = log_ndtr(v), log_ndtr(-v)
         ends = self._tails()
@@ -261,13 +261,6 @@ class StratifiedDistribution:
         """Return all strata but the largest."""
         largest = int(np.argmax([each.share for each in self.strata]))
         return [k for k in range(len(self.strata)) if k != largest]
-
-    def _read(self, name: str, points: ArrayLike) -> FloatArray:
-        """Return points as float64 (n, d), if they have that shape."""
-        array = np.asarray(points, dtype=np.float64)
-        if array.ndim != 2 or array.shape[1] != self.dim:
-            raise ValueError(f"Expected {name} of shape (n, {self.dim}), got {array.shape}.")
-        return array
 
     def _tails(self) -> list[tuple[float, float]]:
         """Return the logs of the shares below and above each stratum."""

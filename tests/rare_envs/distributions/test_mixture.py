@@ -119,21 +119,6 @@ def test_density_is_the_product_of_cut_conditionals(mixture: TruncatedGaussianMi
     np.testing.assert_allclose(np.exp(mixture.log_prob(x)), density, rtol=1e-8)
 
 
-def test_one_logarithm_is_scipys_truncated_log_normal() -> None:
-    low, high = 5.0, 60.0
-    row = {"weights": [1.0], "means": [[2.5]], "covariances": [[[0.49]]], "low": [low], "high": [high]}
-    own, reference = (
-        TruncatedGaussianMixture.from_dict({**row, "coordinates": ["log"]}),
-        stats.lognorm(0.7, scale=np.exp(2.5)),
-    )
-    mass = reference.cdf(high) - reference.cdf(low)
-    x = np.linspace(5.01, 59.9, 50)
-    np.testing.assert_allclose(own.log_prob(x[:, None]), reference.logpdf(x) - np.log(mass), rtol=1e-12)
-    u = stats.norm.ppf((reference.cdf(x) - reference.cdf(low)) / mass)
-    np.testing.assert_allclose(own.to_standard_normal(x[:, None])[:, 0], u, atol=1e-10)
-    np.testing.assert_allclose(own.from_standard_normal(u[:, None])[:, 0], x, rtol=1e-9)
-
-
 def truncated(mean: Any, deviation: float, low: Any, high: Any) -> Any:
     return stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, mean, deviation)
 
@@ -217,15 +202,6 @@ def test_u_rises_with_its_own_column_and_faces_and_far_tails_are_finite(mixture:
     x = mixture.from_standard_normal(np.random.default_rng(5).uniform(-38.0, 38.0, (10, mixture.dim)))
     assert ((x > mixture.low) & (x < mixture.high)).all()
     assert np.isfinite(mixture.log_prob(x)).all()
-
-
-def test_one_gaussian_far_from_its_box_is_affine() -> None:
-    covariance = np.array([[4.0, 1.2], [1.2, 1.0]])
-    mixture = TruncatedGaussianMixture([1.0], [[10.0, -3.0]], [covariance], [-90.0, -53.0], [110.0, 47])
-    u = np.random.default_rng(0).uniform(-9.0, 9.0, (1000, 2))
-    expected = [10.0, -3.0] + u @ np.linalg.cholesky(covariance).T
-    np.testing.assert_allclose(mixture.from_standard_normal(u), expected, atol=1e-12)
-    np.testing.assert_allclose(mixture.to_standard_normal(expected), u, atol=1e-12)
 
 
 def test_tail_of_a_tail_agrees_with_survival_functions() -> None:

@@ -175,7 +175,7 @@ def test_vehicles_that_begin_in_each_other_are_refused() -> None:
 
 def test_others_are_drawn_again_where_a_given_value_puts_vehicles_into_each_other() -> None:
     """One in five drawn lead gaps is under 5 m."""
-    env = rare_envs.make_batch("rare_envs/CutIn-v1", 200)
+    env = gym.make_vec("rare_envs/CutIn-v1", 200)
     _, info = env.reset(seed=0, options={"cut_in_gap": -10.0})
     assert (info["scenario"]["cut_in_gap"] == -10.0).all() and (info["scenario"]["lead_gap"] > 5.0).all()
     assert not info["collision"].any()
