@@ -48,6 +48,8 @@ class Hyperparameters:
     """Standard deviation of the exploration noise of a policy that has none of its own."""
     reward_scale: float = 1.0
     """Factor of the rewards that it learns from."""
+    num_envs: int = 256
+    """Episodes that run side by side."""
 
 
 # A simulation step of hundreds of environments costs about as much as one of a few, so rollouts are
@@ -60,7 +62,7 @@ _OFF_POLICY = {"gamma": 0.98, "batch_size": 1024, "train_freq": 1, "gradient_ste
 # The actor runs in every estimate, the critic not.
 _ACTOR_CRITIC = {"net_arch": {"pi": [32, 32], "vf": [64, 64]}, "log_std_init": -1.5}
 _NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
-_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 4, "clip_range": 0.4, "learning_rate": 3e-3}
+_PPO = {**_ON_POLICY, "n_steps": 16, "batch_size": 2048, "n_epochs": 5, "clip_range": 0.4, "learning_rate": 2e-3}
 _PPO_POLICY = {**_ACTOR_CRITIC, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
 _A2C = {**_ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
 _DQN = {
@@ -72,7 +74,7 @@ _DQN = {
 }
 HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02),
+        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02, num_envs=512),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
         "sac": Hyperparameters(_OFF_POLICY, _NETS),
         "td3": Hyperparameters(_OFF_POLICY, _NETS, noise=0.2),
@@ -144,7 +146,7 @@ def train_ego(
     algo: str = "ppo",
     steps: int = 200_000,
     seed: int = 0,
-    num_envs: int = 256,
+    num_envs: int | None = None,
     out: str | Path = Path("ego.zip"),
     progress: bool = True,
     resume: bool = False,
@@ -163,7 +165,7 @@ def train_ego(
         algo: One of `HYPERPARAMETERS`: "ppo", "a2c", "sac", "td3", "dqn".
         steps: Environment steps, summed over the batch; rounded up to whole rollouts.
         seed: Seed of the networks, the exploration and the scenarios.
-        num_envs: Episodes that run side by side.
+        num_envs: Episodes that run side by side; by default 512 with PPO and 256 with the others.
         out: The `.zip` to write; missing folders are made, a missing suffix is added.
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
@@ -207,6 +209,8 @@ def train_ego(
     if not ids or len(set(ids)) < len(ids) or (retraining is not None and len(ids) > 1):
         which = "one environment to train on in" if retraining else "different environments, one or more"
         raise ValueError(f"Expected {which}, got {', '.join(ids) or 'none'}.")
+    hyperparameters = HYPERPARAMETERS[algo]
+    num_envs = hyperparameters.num_envs if num_envs is None else num_envs
     target, device = _prepare_target(Path(out)), make_kwargs.get("device", "cpu")
     arguments = {"env_id": ",".join(ids), "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
     arguments |= {"even_strata": even_strata}
@@ -225,7 +229,6 @@ def train_ego(
 
     from training.vec_env import sb3_vec_env
 
-    hyperparameters = HYPERPARAMETERS[algo]
     kind = {**split_layout(ids[0])[1], **make_kwargs}.get("action", "continuous")
     make_kwargs |= {"action": "discrete"} if hyperparameters.discrete and kind == "continuous" else {}
     env = sb3_vec_env(ids, num_envs, even_strata=even_strata, reward_scale=hyperparameters.reward_scale, **make_kwargs)

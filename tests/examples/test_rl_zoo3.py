@@ -17,8 +17,6 @@ from training.ego_training import HYPERPARAMETERS
 FOLDER = Path(__file__).parents[2] / "examples" / "rl_zoo3"
 OF_THE_ZOO = ("n_envs", "n_timesteps", "policy", "policy_kwargs", "normalize")
 """Settings of the training, not of the algorithm, and those of others that the Zoo reads as Python."""
-OURS = 256
-"""Environments of `train_ego`; the Zoo's are fewer, with as many transitions between updates."""
 
 
 def read(algo: str) -> dict[str, dict[str, Any]]:
@@ -39,13 +37,13 @@ def test_settings_are_those_of_our_own_training(algo: str) -> None:
     entries, ours, per_step = read(algo), HYPERPARAMETERS[algo], {"ppo": "n_steps", "dqn": "train_freq"}[algo]
     assert set(entries) == set(rare_envs.ENV_IDS)
     for entry in entries.values():
-        assert entry[per_step] * entry["n_envs"] == ours.settings[per_step] * OURS
+        assert entry[per_step] * entry["n_envs"] == ours.settings[per_step] * ours.num_envs  # the Zoo's are fewer
         same = {name: value for name, value in ours.settings.items() if name != per_step}
         assert {name: entry[name] for name in same} == same
         assert policy_of(entry) == {**ours.policy, "activation_fn": nn.ReLU}
         assert ("normalize" in entry) == (ours.reward_scale != 1.0)
         if algo == "dqn":  # `train_ego` keeps every transition, and waits for ten of each environment
-            assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * OURS
+            assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * ours.num_envs
 
 
 def test_the_algorithms_take_them() -> None:
