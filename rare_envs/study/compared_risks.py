@@ -436,8 +436,8 @@ def _ask_near(question: Question) -> tuple[Question, Question]:
     """Return the question of crashes and that of near-crashes, which share the simulations."""
     n = question.max_sim
     if n is not None:
-        check_whole("max_sim (of A and B, crashes and near-crashes)", n, 4)
-    near = None if n is None else max(2, round(NEAR_SHARE * n))
+        check_whole("max_sim (of A and B, crashes and near-crashes)", n, 8)  # two draws of each
+    near = None if n is None else max(4, round(NEAR_SHARE * n))
     more = replace(question, measure="near_crash", gamma=0.0, max_ratio=None, core="auto", max_sim=near)
     return replace(question, max_sim=None if n is None or near is None else n - near), more
 

@@ -329,13 +329,14 @@ def risk(
 def resume_risk(folder: Path, questions: Mapping[str, Question], whole: Mapping[str, Any], **how: Any) -> Risk:
     """Continue an interrupted risk from its arguments, `whole`, and the questions that it has begun.
 
-    The answer is that of an undisturbed one; `how` has trust and an executor.
+    The answer is that of an undisturbed one; `how` has trust, an executor and, if it is to change, on_error.
     """
     trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
     with as_bad_input(KeyError, TypeError, AttributeError):
         for question in list_asked(whole, {"ego": whole["ego"]}):
             open_question(asdict(question), folder, trust)
         options = {**whole["options"], "trust": trust, "core": first.core, "device": first.device}
+        options |= {"on_error": how["on_error"]} if how["on_error"] else {}
         return _risk(whole["ego"], dict(whole), whole["bases"], folder, True, False, executor, options)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,7 +16,6 @@ from rare_envs.study.arguments import BadInput, Question, as_bad_input, find_met
 from rare_envs.study.cli import options
 from rare_envs.study.cli.options import command
 from rare_envs.study.cli.shell import DOUBTFUL, EXECUTOR, Answer, tell
-from rare_envs.study.run_folder import RESULT
 
 if TYPE_CHECKING:
     from samplers import Estimate
@@ -335,26 +333,25 @@ def resume_command(
 
     trust = asked["trust"]
     folder, whole, questions = writing.find_whole(run, mend)
-    if whole and (ego or on_error):
-        begun = (folder / name for name in questions)
-        part = shlex.quote(str(next((each for each in begun if not (each / RESULT).exists()), folder)))
-        first = f"resume the scenario that has them first (rare-envs resume {part}), then this without them"
+    command = whole.get("command", "")
+    if wrong := ("--ego" if whole and ego else "--on-error" if on_error and command not in ("", "risk") else ""):
         raise BadInput(
-            f"--ego and --on-error are for a run of one scenario, and {str(run)!r} is of {whole['command']}: "
-            f"{first if whole['command'] == 'risk' else 'resume it without them'}, or begin again with --force."
+            f"{wrong} is for a run of one scenario{'' if ego else ', or a risk'}, and {str(run)!r} is of {command}: "
+            f"resume it without{', the ego at the address that it had' if ego else ''}, or begin again with --force."
         )
     if not whole:
         return tell(evaluate.resume(run, ego, on_error, trust, progress=True, executor=executor), run, details)
-    if whole["command"] == "estimate":
+    if command == "estimate":
         from rare_envs.study.question import open_question
 
         (question,) = questions.values()
         opened = open_question(asdict(question), folder, trust, core=question.core, device=question.device)
         return estimate_highway_env(opened, whole["env_config"], folder, False, details, executor)
-    if whole["command"] == "compare":
+    if command == "compare":
         return tell(comparison.resume_comparison(folder, questions, trust, executor), folder, details)
     from rare_envs.study.risk import resume_risk
 
-    resume = compared_risks.resume_compared_risks if whole["command"] == writing.SUM else resume_risk
+    resume = compared_risks.resume_compared_risks if command == writing.SUM else resume_risk
     with as_bad_input(ValueError):
-        return tell(resume(folder, questions, whole, trust=trust, executor=executor), folder, details)
+        how = {"trust": trust, "executor": executor, "on_error": on_error}
+        return tell(resume(folder, questions, whole, **how), folder, details)

@@ -13,7 +13,8 @@ import rare_envs
 import samplers
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.exposure import MILLION_KM
-from rare_envs.study.compared_risks import RateComparison
+from rare_envs.study.arguments import BadInput
+from rare_envs.study.compared_risks import RateComparison, RiskComparison, compare_risks
 from rare_envs.study.comparison import compare_egos, weigh_crashes
 from rare_envs.study.question import Question
 from rare_envs.study.run_folder import read_failures
@@ -76,6 +77,44 @@ def compute_exact(a: float, b: float) -> dict[str, float]:
     both = float(stats.multivariate_normal.cdf([-a, -b], cov=[[1.0, 0.36], [0.36, 1.0]]))
     p_a, p_b = stats.norm.sf(a), stats.norm.sf(b)
     return {"a": p_a, "b": p_b, "both": both, "only_a": p_a - both, "only_b": p_b - both}
+
+
+@pytest.mark.parametrize(
+    ("at", "max_ratio", "decision", "said"),
+    [
+        ((2.0, 9.0), 1.0, "passes", "cc_human crashes more than "),  # B never fails: its upper limit counts
+        ((2.0, 9.0), 0.01, "undecided", "no failure of ppo.zip"),
+        ((9.0, 2.0), 1.0, "fails", "cc_human crashes less than "),
+        ((9.0, 9.0), 1.0, "undecided", "not known: no failure of cc_human or ppo.zip found"),
+    ],
+)
+def test_an_ego_without_a_failure_has_limits(
+    at: tuple[float, float], max_ratio: float, decision: str, said: str
+) -> None:
+    about: dict[str, Any] = {"hours": 10.0, "km": 4000.0, "definition": "events", "source": "made up"}
+    found = RiskComparison(
+        ego_a="cc_human",
+        ego_b="ppo.zip",
+        scenarios={"cut_in": samplers.compare(*half_spaces(*at), "mc", seed=0, max_sim=6000)},
+        frequencies={"cut_in": EventFrequency(count=1000, **about)},
+        max_ratio=max_ratio,
+    )
+    assert found.verdict is not None and found.verdict.decision == decision
+    assert said in " ".join(str(found).split())
+    truth = compute_exact(*at)
+    for key, rate in found.rates.items():
+        low, high = rate.interval_per_million_km
+        assert low <= 1e6 * 0.25 * truth[key] <= high and high > 0, key
+    # a careful human that crashes more often than people says that the traffic is at fault
+    assert ("cc_human crashes 15,000 times as often as people" in str(found)) == (at[0] == 2.0)
+
+
+def test_few_simulations_bound_all_and_fewer_are_refused() -> None:
+    with pytest.raises(BadInput, match="at least 8, got 7"):
+        compare_risks("idm", "rss", max_sim=7)
+    found = compare_risks("idm", "rss", scenarios=["hard_brake"], max_sim=8, max_ratio=1.0, seed=0)
+    assert found.n_sim == 8 and found.verdict is not None and found.verdict.decision == "undecided"
+    assert math.isnan(found.ratio) and all(rate.interval_per_million_km[1] > 1e5 for rate in found.rates.values())
 
 
 @pytest.mark.slow

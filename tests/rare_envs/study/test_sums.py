@@ -93,6 +93,38 @@ def test_a_risk_that_was_stopped_is_resumed_or_goes_on_with_the_same_command(
     assert_refused(cli("resume", tmp_path / "run"), "no unfinished run", "a finished one (risk.json)")
 
 
+PICKY = """
+import numpy as np
+
+
+class Picky:
+    def predict(self, seen, state=None, episode_start=None, deterministic=True):
+        acts = np.zeros((len(seen), 2))
+        acts[(1e4 * seen[:, 3] % 1 < 0.03) & bool(episode_start[0])] = np.nan
+        return acts, None
+"""
+"""An ego that gives no answer in 3 % of all scenarios."""
+
+
+@pytest.mark.slow
+def test_a_risk_whose_ego_fails_goes_on_with_another_on_error(
+    here: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its answer is that of a risk that counted so from the beginning."""
+    (here / "picky.py").write_text(PICKY)
+    monkeypatch.setattr(DrivingProblem, "tile", 20)
+    asked = ("--scenario", "hard_brake", "--base", f"hard_brake={brakings}", "--method", "mc", "--max-sim", "60")
+    words = ("risk", "picky:Picky", *asked, "--out")
+    assert_refused(cli(*words, "run"), "failed twice", "rare-envs resume run")
+    assert_refused(cli("resume", "run", "--ego", "tcp://localhost:5"), "--ego is for a run of one scenario")
+    assert cli("resume", "run", "--on-error", "failure").exit_code in (0, 3)
+    (here / "how.yaml").write_text("on_error: failure\n")
+    assert cli(*words, "whole", "--config", "how.yaml").exit_code in (0, 3)
+    found, whole = (answer(here / name, "risk.json") for name in ("run", "whole"))
+    rate = whole["scenarios"]["hard_brake"]["p"]
+    assert found["scenarios"]["hard_brake"]["p"] == rate > 0 and found["text"] == whole["text"]
+
+
 def test_the_page_of_a_sum_names_its_parts_and_its_events(tmp_path: Path, brakings: str) -> None:
     run_into(tmp_path / "run", prepare(Question(env_id=BRAKE, base=brakings, method="mc", max_sim=500)))
     (page,) = write_html_report(tmp_path / "run")
