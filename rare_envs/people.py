@@ -268,7 +268,7 @@ class EventRate:
     @property
     def people(self) -> HumanBenchmark | None:
         """Contacts of people in the same event; None if nobody has counted them."""
-        return count_people(self.event)
+        return people_in(self.event).contacts if self.event in COUNTED else None  # type: ignore[arg-type]
 
     @property
     def uncalibrated(self) -> str:
@@ -289,11 +289,6 @@ class EventRate:
             "uncalibrated": self.uncalibrated,
             "calibration": None if self.calibration is None else self.calibration.to_dict(),
         }
-
-
-def count_people(event: str) -> HumanBenchmark | None:
-    """Return people's contacts in a kind of event; None if nobody has counted them."""
-    return people_in(event).contacts if event in COUNTED else None  # type: ignore[arg-type]
 
 
 def sum_people(events: Sequence[EventRate]) -> HumanBenchmark | None:
