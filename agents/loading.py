@@ -35,8 +35,8 @@ EXPECTED_EGO: Final = (
 )
 EGO_SUFFIXES = (".zip", ".onnx", SUFFIX)
 """How the files of egos end."""
-WEIGHTS_SUFFIXES = (".pt", ".pth", ".ckpt", ".cleanrl_model", ".pkl", ".pickle", ".msgpack")
-"""How files end whose network only their author's code has."""
+WEIGHTS_SUFFIXES = (".pt", ".pth", ".pt2", ".bin", ".ckpt", ".cleanrl_model", ".pkl", ".pickle", ".msgpack")
+"""How files end that code of the user's opens."""
 
 
 @runtime_checkable
@@ -239,7 +239,7 @@ def _refuse_url(text: str, *_: Any) -> Any:
 
 
 def _refuse_weights(text: str, *_: Any) -> Any:
-    raise ValueError(f"The network of {text!r} is not in the file: {ADAPTER_ADVICE.format(file=text)}.")
+    raise ValueError(f"Code of yours opens a file such as {text!r}: {ADAPTER_ADVICE.format(file=text)}.")
 
 
 def _make_ego(spec: str, *_: Any) -> Any:
@@ -254,7 +254,10 @@ def _make_ego(spec: str, *_: Any) -> Any:
 KINDS: dict[str, tuple[Callable[[str], bool], Callable[..., Any]]] = {
     "process": (lambda spec: spec.startswith("process:"), _load_elsewhere),
     "noisy": (lambda spec: spec.startswith("noisy:"), _load_noisy),
-    "hub": (lambda spec: spec.startswith(HUB_PREFIX), lambda text, *how: load_saved_ego(find_hub_model(text), *how)),
+    "hub": (
+        lambda at: at.startswith(HUB_PREFIX),
+        lambda at, *how: load_saved_ego(cast(Path, find_hub_model(at)), *how),
+    ),
     "remote": (lambda spec: spec.startswith(("tcp://", "ipc://")), _load_elsewhere),
     "function": (_is_function, _make_ego),
     "url": (lambda spec: "://" in spec, _refuse_url),

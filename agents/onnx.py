@@ -98,7 +98,8 @@ class OnnxEgo:
         self._inputs = sorted(inputs, key=lambda port: not port.name.lower().startswith("obs"))
         batch = next(iter(self._inputs[0].shape), None)
         self._axes = [_find_batch_axis(port, batch, path) for port in self._inputs]
-        actions = _choose_actions(outputs)
+        memories = [_name_part(port) for port in self._inputs[1:]]
+        actions = _choose_actions([port for port in outputs if _name_part(port) not in memories] or outputs, path)
         self._outputs = [actions, *_pair_memory(self._inputs[1:], [port for port in outputs if port != actions], path)]
         self.fixed_batch: int | None = None
         self._tried = self._try_sizes(batch)
@@ -198,10 +199,8 @@ class OnnxEgo:
 def _find_batch_axis(port: Any, batch: Any, path: Path) -> int:
     """Return the axis of an input along which its rows are, the one of no fixed size, if any; else a ValueError."""
     free = [axis for axis, size in enumerate(port.shape) if not isinstance(size, int)]
-    if not free:
-        free = [axis for axis, size in enumerate(port.shape[:2]) if size == (batch if isinstance(batch, int) else 1)][
-            :1
-        ]
+    rows = batch if isinstance(batch, int) else 1
+    free = free or [axis for axis, size in enumerate(port.shape[:2]) if size == rows][:1]
     if port.type not in _TYPES or len(port.shape) < 2 or len(free) != 1:
         raise ValueError(
             f"Expected input {port.name!r} of {str(path)!r} to be numbers of shape (batch, fixed sizes), got "
@@ -210,8 +209,8 @@ def _find_batch_axis(port: Any, batch: Any, path: Path) -> int:
     return free[0]
 
 
-def _choose_actions(outputs: Sequence[Any]) -> Any:
-    """Return the output that has the actions: the one named so (means before draws), else the first of their form."""
+def _choose_actions(outputs: Sequence[Any], path: Path) -> Any:
+    """Return the output that has the actions: the one named so (means first), else the only one of their form."""
     named = [port for port in outputs if _ACTIONS.fullmatch(port.name)]
     named.sort(key=lambda port: "deterministic" not in port.name)
 
@@ -219,15 +218,22 @@ def _choose_actions(outputs: Sequence[Any]) -> Any:
         sizes = list((port.shape or [])[1:])
         return sizes in ([], [1]) if "int" in port.type else sizes == [2] or _are_scores(port.shape or [])
 
-    return (named or list(filter(fits, outputs)) or list(outputs))[0]
+    fitting = named or list(filter(fits, outputs)) or list(outputs)
+    if not named and len(fitting) > 1:
+        raise ValueError(
+            f"Expected one output of {str(path)!r} to be the actions, got {', '.join(port.name for port in fitting)}; "
+            "export it with one, named actions (the mean of PPO, tanh of SAC's)."
+        )
+    return fitting[0]
 
 
 def _pair_memory(inputs: Sequence[Any], outputs: Sequence[Any], path: Path) -> list[Any]:
     """Return the outputs that inputs of a memory come from, by their names but for "next", say, or by their order."""
-    by_name = {_name_part(port): port for port in outputs}
-    found = [by_name.get(_name_part(port)) for port in inputs]
-    if None not in found:
-        return found
+    for ending in ("", r"\d+|n|x"):  # h0 and c0 become h1 and c1, hn and cn
+        by_name = {_name_part(port, ending): port for port in outputs}
+        found = {_name_part(port, ending): by_name.get(_name_part(port, ending)) for port in inputs}
+        if None not in found.values() and len(found) == len(inputs):
+            return [*found.values()]
     if len(inputs) != len(outputs):
         names = " and ".join(str([port.name for port in ports]) for ports in (inputs, outputs))
         raise ValueError(
@@ -237,9 +243,10 @@ def _pair_memory(inputs: Sequence[Any], outputs: Sequence[Any], path: Path) -> l
     return list(outputs)
 
 
-def _name_part(port: Any) -> tuple[str, ...]:
-    """Return the words of a name of a memory, without those that tell its input and output apart."""
-    return tuple(word for word in re.split(r"[^a-z0-9]+", port.name.lower()) if word not in _TURNS)
+def _name_part(port: Any, ending: str = "") -> tuple[str, ...]:
+    """Return the words of a name of a memory, without those and endings that tell its input and output apart."""
+    words = re.split(r"[^a-z0-9]+", port.name.lower())
+    return tuple(re.sub(rf"(?<=.)({ending})$", "", word) for word in words if word not in _TURNS)
 
 
 def _are_scores(shape: Any) -> bool:

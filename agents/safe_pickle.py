@@ -25,6 +25,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.plugins import import_module
+
 TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
 """Advice on a file that was not opened."""
 TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and any code in it runs"
@@ -96,6 +98,7 @@ class _RenamingUnpickler(pickle.Unpickler):
         """Return what a name stands for; a new generator for one of Gym's."""
         if module.startswith(_GENERATORS[1][:-1]):
             return lambda *_: np.random.default_rng()
+        import_module(_rename(module), "a file of an ego")  # of the working directory too
         return super().find_class(_rename(module), name)
 
 

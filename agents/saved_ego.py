@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -116,10 +116,8 @@ class SavedEgo:
         if self.left_out is None:
             return ()
         why = "the ego's own file says that it was trained without VecNormalize"
-        return (
-            f"{self.left_out} is not applied: {why}; stats: FILE in a file for --config, or "
-            "load_ego(path, stats=FILE), applies it",
-        )
+        how = "stats: FILE in a file for --config, or load_ego(path, stats=FILE), applies it"
+        return (f"{self.left_out} is not applied: {why}; {how}",)
 
     def find_normalisation_doubt(self, expected: Any) -> str:
         """Return what is wrong with its statistics for an environment's space of observations; "" if nothing seems."""
@@ -130,11 +128,7 @@ class SavedEgo:
         last = _open_observation(self.header, LAST)
         if missing := describe_missing_statistics(self.header, last, self.policy.observation_space, expected):
             return f"the ego has no VecNormalize statistics, but {missing}; {STATS_ADVICE}"
-        if (
-            isinstance(last, np.ndarray)
-            and last.ndim == 3
-            and last.shape[1:] == expected.shape == observation_space(2, "kinematics").shape
-        ):
+        if getattr(last, "shape", ())[1:] == expected.shape == observation_space(2, "kinematics").shape:
             what = describe_other_kinematics(last)
             return f"the observations of the ego's training were {what}; {CONFIG_ADVICE}" if what else ""
         return ""
@@ -377,10 +371,6 @@ def _open_observation(header: Mapping[str, Any], name: str) -> Any:
 # --- the Hugging Face Hub -------------------------------------------------------------------------
 
 
-@overload
-def find_hub_model(text: str) -> Path: ...
-@overload
-def find_hub_model(text: str, download: bool) -> Path | None: ...
 def find_hub_model(text: str, download: bool = True) -> Path | None:
     """Return the file of a policy "hf:USER/REPOSITORY"; None if it is not in the cache and nothing is to be downloaded.
 

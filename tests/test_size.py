@@ -17,7 +17,7 @@ LIMITS = {
     "functions": 3_220,
     "classes": 472,
     "import lines, percent of code": 10.5,
-    "test lines": 34_020,
+    "test lines": 34_050,
     "pages": 18,
     "words of pages": 37_070,
     "files entered by an estimate": 43,

@@ -7,6 +7,7 @@ another `ego`.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
@@ -75,11 +76,7 @@ class FunctionEgo:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
         """Stable-Baselines3's `predict`; the function has no memory."""
-        actions = read_output(self.function(observation))
-        try:
-            return np.asarray(actions), state
-        except ValueError:  # parts of several shapes
-            raise ValueError(_ONE_OUTPUT.format(got=f"{len(actions)} outputs")) from None
+        return np.asarray(read_output(self.function(observation))), state
 
 
 @dataclass(frozen=True)
@@ -100,7 +97,8 @@ class ModuleEgo:
 
     def decide(self, observation: Any) -> torch.Tensor:
         """Return actions for observations of B rows, arrays or tensors, by the module on its own device."""
-        self.module.eval()
+        with contextlib.suppress(NotImplementedError):  # a program of torch.export has one mode
+            self.module.eval()
         parameter = next(self.module.parameters(), torch.empty(0))
         shown = map_kinds(lambda part: torch.as_tensor(part).to(parameter), observation)
         with torch.no_grad():
@@ -124,7 +122,8 @@ def read_output(output: Any) -> Any:
     pair = isinstance(output, tuple) and any(isinstance(part, torch.Tensor | Distribution) for part in parts)
     if pair or any(isinstance(part, Distribution) or getattr(part, "ndim", 0) > 1 for part in parts):
         output, *others = parts
-        if not pair or len(others) != 1 or getattr(others[0], "ndim", 0) != 2 or others[0].shape[1] != 1:
+        several = isinstance(output, tuple | list) or len(others) != 1
+        if not pair or several or getattr(others[0], "ndim", 0) != 2 or others[0].shape[1] != 1:
             raise ValueError(_ONE_OUTPUT.format(got=f"{len(parts)} outputs"))
     if isinstance(output, Distribution):
         try:
@@ -148,6 +147,11 @@ def wrap_callable(ego: Any) -> Any:
     if any(hasattr(ego, name) for name in ("act", "in_world")):  # a driver, or an ego of worlds, that has __call__ too
         return ego
     declared = (getattr(ego, f"{name}_space", None) for name in ("observation", "action"))
+    if isinstance(ego, torch.nn.Module) and getattr(ego.forward, "__func__", None) is torch.nn.Module.forward:
+        found = (
+            f"{type(ego).__name__} without; return the part of it that acts ({', '.join(dict(ego.named_children()))})"
+        )
+        raise ValueError(f"Expected a module with forward, got {found}, or a function from observations to actions.")
     return ModuleEgo(ego, *declared) if isinstance(ego, torch.nn.Module) else FunctionEgo(ego)
 
 

@@ -312,11 +312,10 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
     accelerates = action == "continuous" and getattr(acted, "shape", None) == (2,) and not several
     if acted is None or takes_indices(acted) or accelerates:
         return
-    wanted = f"Box(-1, 1, (2,)) (acceleration, steering) or Discrete({len(DISCRETE_ACTIONS)})."
+    wanted, indices = "Box(-1, 1, (2,)) (acceleration, steering) or ", f"Discrete({len(DISCRETE_ACTIONS)})"
     if action != "continuous":
-        names = ", ".join(META_ACTIONS) if action == "meta" else "five accelerations"
-        wanted = (
-            f"Discrete({len(DISCRETE_ACTIONS)}) ({names}); take action='continuous' (--action continuous) for an ego "
-            "that accelerates and steers."
-        )
-    raise ValueError(f"The ego acts in {acted}, the environment takes {wanted}")
+        wanted, indices = "", f"{indices} ({', '.join(META_ACTIONS) if action == 'meta' else 'five accelerations'})"
+    raise ValueError(
+        f"The ego acts in {acted}, the environment takes {wanted}{indices}; choose another kind of actions (--action), "
+        "put an object with predict around it that gives these, or test it in HighwayEnv's ids (docs/egos.md)."
+    )

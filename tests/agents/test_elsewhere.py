@@ -17,6 +17,7 @@ from torch import nn
 from agents import load_ego
 from agents.loading import strip_prefixes
 from rare_envs import DrivingProblem
+from rare_envs.egos.needs import wrap_callable
 from rare_envs.study.arguments import Question
 from rare_envs.study.question import digest_files
 
@@ -36,6 +37,7 @@ class Net(torch.nn.Module):
         out = self.decoder(seen)
         pairs = {"values": (out, out[:, :1]), "normal": (Normal(out, 1.0), out[:, :1]), "deviation": (out, out)}
         squashed = TransformedDistribution(Normal(out, 1.0), [TanhTransform()])
+        pairs |= {"parts": ((out,), out[:, :1])}
         pairs |= {"memory": (out, (out, out)), "list": [out, out[:, :1]], "squashed": squashed}
         return {"mean": out, **pairs, "arrays": (out.detach().numpy(), out[:, :1].detach().numpy())}[self.head]
 """
@@ -56,7 +58,7 @@ def write_weights(file: str, outputs: int = 2) -> nn.Module:
 
 
 @pytest.mark.parametrize("file", ["ppo.cleanrl_model", "any.safetensors"])
-@pytest.mark.parametrize("head", ["mean", "values", "normal", "deviation", "memory", "list", "arrays", "squashed"])
+@pytest.mark.parametrize("head", "mean values normal deviation memory parts list arrays squashed".split())
 @pytest.mark.parametrize("outputs", [2, 5])
 def test_weights_alone_drive_through_a_function(file: str, head: str, outputs: int, seen: Any) -> None:
     layer = write_weights(file, outputs)
@@ -64,13 +66,26 @@ def test_weights_alone_drive_through_a_function(file: str, head: str, outputs: i
     with pytest.raises(ValueError, match=rf"^[^\n]*'{file}'[^\n]*module:function\?file={file} \(docs/egos\.md"):
         load_ego(file)
     ego: Any = load_ego(f"adapter_for_test:Net?file={file}&head={head}")
-    if head in ("deviation", "memory", "list", "arrays", "squashed"):  # a mean may be squashed or not, say
+    if head in ("deviation", "memory", "parts", "list", "arrays", "squashed"):  # a mean may be squashed or not, say
         with pytest.raises(ValueError, match=r"^.* \(B, 1\), got (2|a Trans).* module around .*tanh.*$"):
             ego.predict(seen)
     elif outputs == 5:  # scores of discrete actions, of which the best counts
         assert ego.predict(seen)[0].tolist() == expected.argmax(1).tolist()
     else:
         np.testing.assert_allclose(ego.predict(seen)[0], expected, atol=1e-5)
+
+
+def test_an_exported_program_drives_and_a_module_without_forward_names_its_parts(seen: Any) -> None:
+    agent, rows = nn.ModuleDict({"critic": nn.Linear(11, 1), "actor": nn.Linear(11, 2)}), {0: torch.export.Dim("rows")}
+    expected = agent["actor"](torch.from_numpy(seen)).numpy(force=True)
+    program = torch.export.export(agent["actor"], (torch.zeros(2, 11),), dynamic_shapes=(rows,))
+    torch.export.save(program, "a.pt2")
+    with pytest.raises(ValueError, match=r"module:function\?file=a\.pt2"):
+        load_ego("a.pt2")
+    exported = wrap_callable(torch.export.load("a.pt2").module())
+    np.testing.assert_allclose(exported.predict(seen)[0], expected, atol=1e-6)
+    with pytest.raises(ValueError, match=r"got ModuleDict without; return the part .* \(critic, actor\)"):
+        DrivingProblem("rare_envs/CutIn-v0", ego=agent)
 
 
 @pytest.mark.parametrize("file", ["a.pt", "a.zip", "a.onnx", "a.safetensors", "there/a.pt"])

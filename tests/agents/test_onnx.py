@@ -122,14 +122,6 @@ def test_a_network_of_plain_pytorch_drives(fixed: int | None, tmp_path: Path) ->
     observation = np.random.default_rng(0).normal(size=(5, COLUMNS)).astype(np.float32)
     np.testing.assert_allclose(ego.predict(observation)[0], network(torch.from_numpy(observation)), atol=1e-6)
 
-    class Same:
-        def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
-            return network(torch.from_numpy(observation)).numpy(), None
-
-    problems = [rare_envs.DrivingProblem(ENV, ego=each, horizon=1.0) for each in (ego, Same())]
-    x = problems[0].base.sample(10, np.random.default_rng(0))
-    np.testing.assert_allclose(problems[0].evaluate(x), problems[1].evaluate(x), atol=1e-4)
-
 
 def test_the_best_of_five_scores_is_the_action(tmp_path: Path) -> None:
     network = nn.Linear(COLUMNS, 5).requires_grad_(False)
@@ -207,11 +199,29 @@ def test_a_memory_with_its_layers_first_is_kept_row_by_row(tmp_path: Path) -> No
         np.testing.assert_allclose(action, expected, atol=1e-6)
 
 
+class TwoMemories(nn.Module):
+    def forward(self, obs: torch.Tensor, h0: torch.Tensor, c0: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return obs[:, :2] + h0, c0 + 10.0, h0 + 1.0
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("after", [("c1", "h1"), ("cn", "hn"), ("next_c0", "next_h0"), ("c", "h_out")])
+def test_memories_are_paired_by_their_names(after: tuple[str, str], tmp_path: Path) -> None:
+    examples = torch.zeros(1, COLUMNS), torch.zeros(1, 2), torch.zeros(1, 2)
+    names = {"input_names": ["obs", "h0", "c0"], "output_names": ["actions", *after]}
+    torch.onnx.export(TwoMemories(), examples, str(tmp_path / "ego.onnx"), dynamo=False, **names)
+    ego = load_ego(tmp_path / "ego.onnx")
+    action, _ = ego.predict(np.zeros((2, COLUMNS)), ego.predict(np.zeros((2, COLUMNS)))[1])
+    assert (action == 1.0).all()
+
+
 def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.onnx").write_bytes(b"not a graph")
     with pytest.raises(ValueError, match=r"Cannot load .*broken\.onnx' as ONNX"):
         load_ego(tmp_path / "broken.onnx")
     with pytest.raises(ValueError, match=r"one input .* one output"):
         load_ego(write(Recurrent(), tmp_path / "two.onnx", memory=torch.zeros(2, 1, 2), outputs=["a", "b", "c"]))
+    with pytest.raises(ValueError, match=r"one output .* got mean, log_std; export .* tanh of SAC's"):
+        load_ego(write(Outputs("actions", "drawn_actions"), tmp_path / "a.onnx", outputs=["mean", "log_std"]))
     with pytest.raises(ValueError, match=r"acts in Box.*\(4,\)"):
         rare_envs.DrivingProblem(ENV, ego=load_ego(write(nn.Linear(COLUMNS, 4), tmp_path / "four.onnx")))

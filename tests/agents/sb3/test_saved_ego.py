@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 
 import rare_envs
 from agents import Ego, SavedEgo, load_ego
+from rare_envs.plugins import import_object
 
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
 ENV = "rare_envs/CarFollowing-v0"
@@ -154,15 +155,15 @@ def test_spaces_of_gym_which_files_of_version_1_hold_are_those_of_gymnasium(trus
     assert (ego.observation_space, ego.action_space) == (model.observation_space, model.action_space)
 
 
-class OwnPolicy(sb3.sac.policies.SACPolicy):
-    """A user's subclass, whose module says nothing about the algorithm."""
-
-
-def test_a_policy_class_of_the_user_needs_trust_and_is_recognised_by_its_settings(tmp_path: Path) -> None:
-    sb3.SAC(OwnPolicy, Still(), device="cpu", **OFF_POLICY).save(tmp_path / "ego.zip")
-    with pytest.raises(ValueError, match=r"'policy_class' it asks for .*OwnPolicy, which may run code.*trust=True"):
-        load_ego(tmp_path / "ego.zip")
-    assert load(tmp_path / "ego.zip", trust=True).algorithm == "sac"
+def test_a_policy_class_of_the_user_needs_trust_and_may_lie_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own_policy.py").write_text("from stable_baselines3.sac.policies import SACPolicy\nclass Own(SACPolicy): pass")
+    sb3.SAC(import_object("own_policy:Own", "the test"), Still(), device="cpu", **OFF_POLICY).save("ego.zip")
+    monkeypatch.delitem(sys.modules, "own_policy")
+    refuse(Path("ego.zip"), r"'policy_class' it asks for own_policy\.Own, which may run code.*trust=True")
+    assert load(Path("ego.zip"), trust=True).algorithm == "sac"
 
 
 def test_algo_overrides_what_the_file_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
