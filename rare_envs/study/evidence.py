@@ -212,9 +212,10 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
     with output_folder(out, PAGE, *FILES), as_bad_input(OSError, ValueError, KeyError, TypeError):
         remove_evidence(folder)
         content = describe_sum(folder, recorded, reports, filed)
-        _finish(folder, recorded["ego"], content, build_claims_of_sum(recorded), recorded["text"])
-    pages = (out / PAGE, *(out / name for name in (*content, CLAIMS, MANIFEST, PICTURE, SCHEMA_FILE)))
-    return (*(path for _, files in found.values() for path in files), *pages)
+        title = f"{recorded['ego']} in {' and '.join(map(name_scenario, reports))}"
+        _finish(folder, title, content, build_claims_of_sum(recorded), recorded["text"])
+    names = (PAGE, *content, MANIFEST, PICTURE, SCHEMA_FILE)  # claims among its content by now
+    return (*(path for _, files in found.values() for path in files), *(out / name for name in names))
 
 
 def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Report | str, tuple[Path, ...]]:
@@ -337,8 +338,8 @@ def _agree(a: Any, b: Any) -> bool:
 
 def _describe_again(file: str, differing: list[str] | None, reason: str) -> dict[str, Any]:
     """Return what was found by computing a result again."""
-    what = f"{file} computed again by the method from the simulations recorded"
-    return {"what": what, "differing": differing, "reason": reason}
+    about = {"what": f"{file} computed again by the method from the simulations recorded"}
+    return {**about, "differing": differing, "reason": reason}
 
 
 def list_failures(study: LoadedStudy) -> list[int]:
@@ -741,9 +742,8 @@ def _describe_limit(result: Mapping[str, Any]) -> str:
 
 def _describe_gate(gate: Mapping[str, Any] | None) -> str:
     """Return what was decided of a limit."""
-    if not gate:
-        return "no acceptance limit was set"
-    return f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}"
+    known = f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}" if gate else ""
+    return known or "no acceptance limit was set"
 
 
 def _find_upper_limit(result: Mapping[str, Any]) -> float:

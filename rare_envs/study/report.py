@@ -205,8 +205,9 @@ class Repeatability(NamedTuple):
 
 def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.analysis.Verdict:
     """Return whether a rate is below a limit; undecided for a reason, if there is one."""
-    ends = rate.interval_per_million_km
-    return judge_ends(limit, ends, rate.confidence, reason, quantity="collisions per million km")
+    rates = rate.rates if isinstance(rate, TotalRate) else (rate,)
+    about = {"quantity": "collisions per million km", "includes_base": all(each.base_log_sd > 0 for each in rates)}
+    return judge_ends(limit, rate.interval_per_million_km, rate.confidence, reason, **about)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import os
 import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,6 +30,8 @@ CHUNK, LARGEST_DOCUMENT = 1 << 24, 1 << 28
 """Characters of JSON read at a time (documents have 1e4 to 1e6), and after which one that does not end is broken."""
 LONGEST_LINE = 2**16
 """Characters of a line."""
+MAX_GZIP_RATIO, LEAST_UNPACKED = 100, 2**20
+"""How many times its size a gzipped file may unpack to, and bytes that any may."""
 GZIP, DELIMITERS = b"\x1f\x8b", (",", ";", "\t")
 """First bytes of a gzipped file, and what may stand between columns."""
 BLANK = ' \t\r\n,;"\x1a'
@@ -103,11 +106,26 @@ class Rows:
         self.refuse(~(np.isfinite(values) | empty), lambda row: f"{header} is {values[row]:g}, a number was expected.")
 
 
+class _Gzip(gzip.GzipFile):
+    """A gzipped file that unpacks to `MAX_GZIP_RATIO` times its size at most."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        return self._bounded(super().read(size))
+
+    def read1(self, size: int = -1) -> bytes:
+        return self._bounded(super().read1(size))
+
+    def _bounded(self, content: bytes) -> bytes:
+        if self.tell() > max(MAX_GZIP_RATIO * os.fstat(self.fileno()).st_size, LEAST_UNPACKED):
+            raise gzip.BadGzipFile(f"it unpacks to more than {MAX_GZIP_RATIO} times its size.")
+        return content
+
+
 def _open_table(path: Path) -> IO[bytes]:
     """Open a file of text, which may be gzipped whatever its name."""
     with open_ordinary(path) as file:
         packed = file.read(len(GZIP)) == GZIP
-    return cast(IO[bytes], gzip.open(path)) if packed else open_ordinary(path)
+    return cast(IO[bytes], _Gzip(path)) if packed else open_ordinary(path)
 
 
 def read_header(path: Path) -> tuple[list[str], str]:

@@ -210,8 +210,10 @@ def report_command(
     filed, changed = [str(path) for path in files], list_changes(files) if files else []
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
     text += "".join(f"\nWrote {path} and the files beside it." for path in filed if path.endswith(".html"))
-    more = f" and {len(changed) - MOST_NAMED} more" if len(changed) > MOST_NAMED else ""
-    text += f"\nChanged since they were written: {', '.join(changed[:MOST_NAMED])}{more}." if changed else ""
+    if changed:
+        more = f" and {len(changed) - MOST_NAMED} more" if len(changed) > MOST_NAMED else ""
+        named = f"{', '.join(changed[:MOST_NAMED])}{more}"
+        text += f"\nChanged since they were written, or not what is computed again: {named}."
     data = {"report": str(page), "figures": [str(path) for path in drawn], "evidence": filed, "changed": changed}
     if files:
         manifest, data["sha256"] = digest_manifest(files)

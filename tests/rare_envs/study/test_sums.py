@@ -157,6 +157,7 @@ def test_limits_are_compared_with_the_one_sided_ends_of_the_sum(brakings: str) -
     assert f", limit {limit:g}; " in str(found.verdict)
     given = judge(max_rate=limit, assume_traffic=True).verdict
     assert found.verdict.low < given.low < given.high < found.verdict.high
+    assert found.verdict.includes_base and not given.includes_base
 
 
 def test_a_limit_of_a_risk_is_one_of_the_sum_over_scenarios(brakings: str, tmp_path: Path, cli: Cli) -> None:
