@@ -3,9 +3,8 @@
     python -m benchmarks.training.speed
 
 Speeds are of short trainings in turn, by the processor's time. For the egos both train for 200,000 steps with each of 8
-seeds that no setting was chosen by, drive the same 2,048 fresh episodes of each scenario, and p is estimated in the
-cut-in. Differences are of pairs with one training seed, and their intervals Student's. Writes
-benchmarks/results/training_speed.json.
+seeds, drive the same 2,048 fresh episodes of each scenario, and p is estimated in the cut-in. Differences are of pairs
+with one training seed, and their intervals Student's. Writes benchmarks/results/training_speed.json.
 """
 
 from __future__ import annotations
