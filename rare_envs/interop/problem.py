@@ -13,7 +13,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from rare_envs.distributions.coordinates import FloatArray
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.needs import EgoWarning, name_ambiguities
-from rare_envs.egos.wrappers import WrappedPolicy, wrap_policy
+from rare_envs.egos.wrappers import WrappedPolicy, find_normalisation_doubt, wrap_policy
 from rare_envs.interop.layouts import idm_groups, restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario, install_fast_observation
 from rare_envs.plugins import as_errors, check_name, did_you_mean, is_policy, one_line, refuse_ego
@@ -159,6 +159,9 @@ class HighwayEnvProblem:
         env, policy = self._driven
         if isinstance(policy, WrappedPolicy) and policy.bounds is not None:
             warnings.warn(name_ambiguities(policy.policy.action_space, ())[-1], EgoWarning, stacklevel=2)
+        usual = env.scene.config["observation"] == {"type": "Kinematics"}
+        if usual and (doubt := find_normalisation_doubt(ego, env.observation_space)):
+            warnings.warn(doubt, EgoWarning, stacklevel=2)
         self._decisions = round(horizon * env.scene.config["policy_frequency"])
         if self._decisions < 1:
             raise ValueError(f"Expected a horizon of one decision of HighwayEnv or more, got {horizon!r} s.")

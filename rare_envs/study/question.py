@@ -252,6 +252,7 @@ def _find_policy_files(name: str, stats: str | None = None) -> list[Path]:
     """Return the files of a policy with its statistics, which lie beside it if they are not named."""
     spec = strip_prefixes(name)
     files = find_named_files(spec)
+    files += [data for path in files if (data := Path(f"{path}.data")).is_file()]  # weights of an ONNX file
     if find_ego_kind(spec) not in ("zip", "hub"):
         return files
     found = [Path(stats)] if stats else [find_statistics(path) for path in files]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from torch import nn
 
 from agents import load_ego
 from agents.loading import strip_prefixes
-from rare_envs import DrivingProblem
-from rare_envs.egos.needs import wrap_callable
+from rare_envs import DrivingProblem, highway_env_problem
+from rare_envs.egos.needs import EgoWarning, wrap_callable
 from rare_envs.study.arguments import Question
 from rare_envs.study.question import digest_files
 
@@ -97,6 +98,8 @@ def test_a_function_takes_whatever_file_its_settings_name(file: str, how: str, s
     question = Question(env_id="", ego=how.format(named))
     assert strip_prefixes(question.ego) == named
     assert [*map(Path, digest_files(question))] == [Path("adapter_for_test.py").resolve(), Path(file)]
+    Path("a.onnx.data").touch()  # where torch puts the weights of an ONNX file
+    assert len(digest_files(Question(env_id="", ego="a.onnx"))) == (2 if file == "a.onnx" else 0)
     if file == "a.zip" or (file[1] == "." and "process" not in how):
         DrivingProblem("rare_envs/CutIn-v0", ego=load_ego(question.ego), drivers=named)
 
@@ -111,5 +114,8 @@ def test_other_kinematics_are_told_by_the_last_observations(setting: dict[str, A
     model._last_obs = env.reset(seed=0)[0][None]  # which training leaves there
     model.save("ego:a?b=c.zip")  # no function
     here = gym.make("rare_envs/CutIn-kinematics-v0").observation_space
-    doubt = load_ego("ego:a?b=c.zip").find_normalisation_doubt(here)  # type: ignore[union-attr]
+    ego = load_ego("ego:a?b=c.zip")
+    doubt = ego.find_normalisation_doubt(here)  # type: ignore[union-attr]
+    with nullcontext() if not doubt else pytest.warns(EgoWarning, match="test it in HighwayEnv's own environment with"):
+        highway_env_problem("highway-fast-v0", ego, config={"vehicles_count": 5})
     assert all(f"({key}); test it in HighwayEnv's" in doubt for key in setting) and bool(doubt) == bool(setting)
