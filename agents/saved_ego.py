@@ -45,9 +45,7 @@ _STEP = 0.5
 _FASTEST = 0.6
 """Speed of an ego in Kinematics, 48 m/s of 80: HighwayEnv's stay below, and cosines of headings are above."""
 CONFIG_ADVICE = "test it in HighwayEnv's own environment with the config of its training (env_config)"
-SBX_ADVICE = (
-    "name module:function, whose function returns sbx.PPO.load(FILE), or of the algorithm that it is (docs/egos.md)"
-)
+SBX_ADVICE = "name module:function, whose function returns sbx.PPO.load(FILE), say (docs/egos.md)"
 OUTLYING = 5.0
 """Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
 
