@@ -108,7 +108,7 @@ def trace(root: Path, run: Callable[[], Any]) -> tuple[int, int]:
         elif event == "call" and not importing[0]:
             if is_ours(root, code.co_filename):
                 files.add(code.co_filename)
-            if code.co_name == "evaluate" and code.co_filename.endswith("rare_envs/problem.py"):
+            if code.co_name in ("evaluate", "attempt") and code.co_filename.endswith("rare_envs/problem.py"):
                 depths.append(sum(is_ours(root, each.f_code.co_filename) for each in callers(frame)))
             else:
                 known.add(code)
