@@ -47,21 +47,23 @@ def draw_scenarios(
     options: Mapping[str, Any] | None,
     n: int,
     rng: np.random.Generator,
-    draw: Callable[[int, np.random.Generator], FloatArray] | None = None,
+    draw: Callable[[NDArray[np.intp]], FloatArray] | None = None,
 ) -> FloatArray:
     """Return scenarios as by `ScenarioSpace.scenario_x`, in which no vehicles begin in each other.
 
-    Where given values put one into another, the others are drawn again; what cannot be set apart is refused.
+    Where given values put one into another, the others of that row are drawn again; what cannot be set apart is
+    refused. `draw` draws some of the rows in place of the traffic model.
     """
-    x = space.scenario_x(options, n, rng, draw)
+    draw_rows = draw or (lambda rows: space.base.sample(len(rows), rng))
+    x = space.scenario_x(options, n, rng, lambda n, rng: draw_rows(np.arange(n)))
     if not options:
         return x
-    contacts = _find_contacts(world, x)
+    contacts, given = _find_contacts(world, x), np.isin(np.repeat(space.names, space.sizes), list(options))
     for _ in range(0 if "x" in options else REDRAWS):
-        if not contacts.any():
+        rows = np.flatnonzero(contacts.any(1).numpy())
+        if not len(rows):
             break
-        rows = contacts.any(1).numpy()
-        x[rows] = space.scenario_x(options, n, rng, draw)[rows]
+        x[rows] = space.validate(np.where(given, x[rows], draw_rows(rows)))
         contacts = _find_contacts(world, x)
     if contacts.any():
         first, pair = contacts.nonzero()[0].tolist()

@@ -268,15 +268,14 @@ class DrivingVectorEnv(StatesLength, VectorEnv[NDArray[np.float32], NDArray[Any]
     def _draw(self, rows: NDArray[np.intp], options: dict[str, Any] | None) -> NDArray[np.float64]:
         """Return scenarios (R, d) of some rows, of which those with a generator of their own draw from that."""
         rng = self.np_random if self._np_random is None else self._np_random  # without the property, which settles
-        own = [self._own.get(row) for row in rows.tolist()]
 
-        def draw(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        def draw(which: NDArray[np.intp]) -> NDArray[np.float64]:
+            own = [self._own.get(row) for row in rows[which].tolist()]
             common = iter(self._ahead.sample(own.count(None), rng) if None in own else ())
             return np.stack([next(common) if each is None else self.space.base.sample(1, each)[0] for each in own])
 
-        return draw_scenarios(
-            self.world, self.space, options, len(rows), rng, draw if self._own else self._ahead.sample
-        )
+        draw_rows = draw if self._own else lambda which: self._ahead.sample(len(which), rng)
+        return draw_scenarios(self.world, self.space, options, len(rows), rng, draw_rows)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None

@@ -179,6 +179,11 @@ def test_others_are_drawn_again_where_a_given_value_puts_vehicles_into_each_othe
     _, info = env.reset(seed=0, options={"cut_in_gap": -10.0})
     assert (info["scenario"]["cut_in_gap"] == -10.0).all() and (info["scenario"]["lead_gap"] > 5.0).all()
     assert not info["collision"].any()
+    batch, singles = gym.make_vec("rare_envs/CutIn-v1", 8), [gym.make("rare_envs/CutIn-v1") for _ in range(8)]
+    for seeds in (range(8), [None] * 8):  # the draws of a row do not depend on what others draw again
+        _, together = batch.reset(seed=None if None in seeds else list(seeds), options={"cut_in_gap": -10.0})
+        alone = [env.reset(seed=seed, options={"cut_in_gap": -10.0}) for env, seed in zip(singles, seeds, strict=True)]
+        np.testing.assert_array_equal(together["x"], [info["x"] for _, info in alone])
 
 
 BETA = BetaDistribution([2.0, 0.5], [2.0, 3.0], [0.0, 1.0], [1.0, 4.0])
