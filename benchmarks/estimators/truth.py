@@ -109,6 +109,7 @@ def truth(world: World, rollouts: int, seed: int, workers: int = 1) -> dict[str,
         "p": p,
         "standard_error": math.sqrt(squares / rollouts - p * p) / math.sqrt(rollouts),
         "seed": seed,
+        "versions": {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__},
     }
 
 
@@ -122,9 +123,8 @@ def main(
 ) -> None:
     """Measure all, or one of the groups or strata, and write the result; others stay."""
     found = json.loads(out.read_text()) if out.exists() else {}
-    versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
     command = " ".join(["python -m benchmarks.estimators.truth", *sys.argv[1:]])
-    found |= {"commands": sorted({*found.get("commands", ()), command}), "versions": versions}
+    found["commands"] = sorted({*found.get("commands", ()), command})
     groups: dict[str, tuple[World, ...]] = {"results": PLAIN, "strata": STRATA}
     if ego != "idm":
         groups = {ego: tuple(world._replace(ego=ego, wide=1.0) for world in STRATA)}
