@@ -10,7 +10,7 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ _MASK = re.compile(r"action_masks?")
 """Inputs that say which actions are allowed, in files of ML-Agents and sb3-contrib."""
 _ACTIONS = re.compile(r"(.*[_.])?actions?", re.IGNORECASE)
 """Names of actions, in files of Stable-Baselines3, ML-Agents and Isaac Lab."""
-_TURNS = {"next", "new", "prev", "previous", "in", "out", "ins", "outs", "input", "output"}
+_TURNS = {"next", "new", "prev", "previous", "in", "out", "ins", "outs", "input", "output", "last"}
 """Words by which the names of a memory before and after a tick differ."""
 _LEAST_PIXELS = 16
 """A shorter first axis of three is that of colours, if the others are no shorter."""
@@ -63,11 +63,11 @@ class OnnxEgo:
     """A policy in an ONNX file, run by onnxruntime on the CPU.
 
     The observations are the input named obs..., else the first: shape (B, ...), of pictures with the channels first or
-    last. The actions are the output named so, else the first of their form: (B, 2) in [-1, 1] (acceleration and
+    last. The actions are the output named so, else the only one of their form: (B, 2) in [-1, 1] (acceleration and
     steering, clipped by the environment), (B,) or (B, 1) integers, or (B, 5) scores of which the best counts. Further
-    inputs are a memory, and so are the outputs of like names, or else as many further outputs in the same order: zeros
-    at the start of an episode, then what the output of the tick before was. Masks of actions allow all. Other outputs,
-    such as values, are left alone. A batch size that the file fixes is kept to, in portions.
+    inputs are a memory, and so are the outputs of like names (the actions too), or else as many further outputs in the
+    same order: zeros at the start of an episode, then what the output of the tick before was. Masks of actions allow
+    all. Other outputs, such as values, are left alone. A batch size that the file fixes is kept to, in portions.
     """
 
     def __init__(self, path: Path) -> None:
@@ -99,8 +99,9 @@ class OnnxEgo:
         batch = next(iter(self._inputs[0].shape), None)
         self._axes = [_find_batch_axis(port, batch, path) for port in self._inputs]
         memories = [_name_part(port) for port in self._inputs[1:]]
-        actions = _choose_actions([port for port in outputs if _name_part(port) not in memories] or outputs, path)
-        self._outputs = [actions, *_pair_memory(self._inputs[1:], [port for port in outputs if port != actions], path)]
+        actions = _choose_actions(outputs, memories, path)
+        others = [port for port in outputs if port != actions]
+        self._outputs = [actions, *_pair_memory(self._inputs[1:], others, actions, path)]
         self.fixed_batch: int | None = None
         self._tried = self._try_sizes(batch)
         shape = self._blank(0)[0].shape[1:]
@@ -209,17 +210,22 @@ def _find_batch_axis(port: Any, batch: Any, path: Path) -> int:
     return free[0]
 
 
-def _choose_actions(outputs: Sequence[Any], path: Path) -> Any:
-    """Return the output that has the actions: the one named so (means first), else the only one of their form."""
+def _choose_actions(outputs: Sequence[Any], memories: Sequence[tuple[str, ...]], path: Path) -> Any:
+    """Return the output that has the actions: the one named so (means first), else the only one of their form.
+
+    Outputs named like an input of a memory are set aside, but "actions" beside "prev_actions" are the actions.
+    """
+    free = [port for port in outputs if _name_part(port) not in memories]
     named = [port for port in outputs if _ACTIONS.fullmatch(port.name)]
-    named.sort(key=lambda port: "deterministic" not in port.name)
+    sure = [port for port in named if port in free or _name_part(port) == _name_part(port, dropped=())]
+    sure.sort(key=lambda port: "deterministic" not in port.name)
 
     def fits(port: Any) -> bool:
         sizes = list((port.shape or [])[1:])
         return sizes in ([], [1]) if "int" in port.type else sizes == [2] or _are_scores(port.shape or [])
 
-    fitting = named or list(filter(fits, outputs)) or list(outputs)
-    if not named and len(fitting) > 1:
+    fitting = sure or [*named, *filter(fits, free)] or free or list(outputs)
+    if not sure and len(fitting) > 1:
         raise ValueError(
             f"Expected one output of {str(path)!r} to be the actions, got {', '.join(port.name for port in fitting)}; "
             "export it with one, named actions (the mean of PPO, tanh of SAC's)."
@@ -227,10 +233,11 @@ def _choose_actions(outputs: Sequence[Any], path: Path) -> Any:
     return fitting[0]
 
 
-def _pair_memory(inputs: Sequence[Any], outputs: Sequence[Any], path: Path) -> list[Any]:
+def _pair_memory(inputs: Sequence[Any], outputs: Sequence[Any], actions: Any, path: Path) -> list[Any]:
     """Return the outputs that inputs of a memory come from, by their names but for "next", say, or by their order."""
-    for ending in ("", r"\d+|n|x"):  # h0 and c0 become h1 and c1, hn and cn
-        by_name = {_name_part(port, ending): port for port in outputs}
+    named = [actions] if _ACTIONS.fullmatch(actions.name) else []
+    for ending in ("", r"\d+|n?s?|x"):  # h0 and c0 become h1 and c1, hn and cn; prev_action is of actions
+        by_name = {_name_part(port, ending): port for port in (*named, *outputs)}
         found = {_name_part(port, ending): by_name.get(_name_part(port, ending)) for port in inputs}
         if None not in found.values() and len(found) == len(inputs):
             return [*found.values()]
@@ -243,10 +250,10 @@ def _pair_memory(inputs: Sequence[Any], outputs: Sequence[Any], path: Path) -> l
     return list(outputs)
 
 
-def _name_part(port: Any, ending: str = "") -> tuple[str, ...]:
+def _name_part(port: Any, ending: str = "", dropped: Collection[str] = _TURNS) -> tuple[str, ...]:
     """Return the words of a name of a memory, without those and endings that tell its input and output apart."""
     words = re.split(r"[^a-z0-9]+", port.name.lower())
-    return tuple(re.sub(rf"(?<=.)({ending})$", "", word) for word in words if word not in _TURNS)
+    return tuple(re.sub(rf"(?<=.)({ending})$", "", word) for word in words if word not in dropped)
 
 
 def _are_scores(shape: Any) -> bool:

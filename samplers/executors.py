@@ -508,6 +508,11 @@ def _has_submit(executor: Any) -> bool:
 
 
 def _count_workers(pool: Any) -> int:
-    """Return the number of workers, as those of `concurrent.futures` and loky tell it, or that of cores."""
-    number = getattr(pool, "_max_workers", None)
-    return number if isinstance(number, int) and number > 0 else os.cpu_count() or 1
+    """Return the number of workers, as pools of several libraries tell it, or that of cores."""
+    for name in ("_max_workers", "num_workers"):
+        number = getattr(pool, name, None)
+        if isinstance(number, int) and number > 0:
+            return number
+    with suppress(Exception):  # of dask
+        return max(1, int(sum(pool._client.nthreads().values())))
+    return os.cpu_count() or 1

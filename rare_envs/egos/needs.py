@@ -76,7 +76,11 @@ class FunctionEgo:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
         """Stable-Baselines3's `predict`; the function has no memory."""
-        return np.asarray(read_output(self.function(observation))), state
+        actions = read_output(self.function(observation))
+        try:
+            return np.asarray(actions), state
+        except ValueError:  # parts of several shapes, as of (actions, None)
+            raise ValueError(_ONE_OUTPUT.format(got=f"{len(actions)} outputs")) from None
 
 
 @dataclass(frozen=True)
@@ -147,12 +151,15 @@ def wrap_callable(ego: Any) -> Any:
     if any(hasattr(ego, name) for name in ("act", "in_world")):  # a driver, or an ego of worlds, that has __call__ too
         return ego
     declared = (getattr(ego, f"{name}_space", None) for name in ("observation", "action"))
-    if isinstance(ego, torch.nn.Module) and getattr(ego.forward, "__func__", None) is torch.nn.Module.forward:
-        found = (
-            f"{type(ego).__name__} without; return the part of it that acts ({', '.join(dict(ego.named_children()))})"
-        )
-        raise ValueError(f"Expected a module with forward, got {found}, or a function from observations to actions.")
-    return ModuleEgo(ego, *declared) if isinstance(ego, torch.nn.Module) else FunctionEgo(ego)
+    if not isinstance(ego, torch.nn.Module):
+        return FunctionEgo(ego)
+    called = type(ego).__call__ is torch.nn.Module.__call__
+    if called and getattr(ego.forward, "__func__", None) is torch.nn.Module.forward:
+        parts = ", ".join(dict(ego.named_children()))
+        part = f"the part of it that acts ({parts}), or " if parts else ""
+        found = f"{type(ego).__name__} without; return {part}a function from observations to actions"
+        raise ValueError(f"Expected a module with forward, got {found}.")
+    return ModuleEgo(ego, *declared)
 
 
 _COLOUR_CHANNELS = (3, 6, 9, 12)

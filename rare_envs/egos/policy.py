@@ -309,13 +309,13 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
             f"train it in this environment or choose {which}."
         )
     several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
-    accelerates = action == "continuous" and getattr(acted, "shape", None) == (2,) and not several
-    if acted is None or takes_indices(acted) or accelerates:
+    accelerates = getattr(acted, "shape", None) == (2,) and not several
+    if acted is None or takes_indices(acted) or (accelerates and action == "continuous"):
         return
     wanted, indices = "Box(-1, 1, (2,)) (acceleration, steering) or ", f"Discrete({len(DISCRETE_ACTIONS)})"
     if action != "continuous":
         wanted, indices = "", f"{indices} ({', '.join(META_ACTIONS) if action == 'meta' else 'five accelerations'})"
-    raise ValueError(
-        f"The ego acts in {acted}, the environment takes {wanted}{indices}; choose another kind of actions (--action), "
-        "put an object with predict around it that gives these, or test it in HighwayEnv's ids (docs/egos.md)."
-    )
+    advice = "put an object with predict around it that gives these, or test it in HighwayEnv's ids (docs/egos.md)."
+    if accelerates:
+        advice = "take action='continuous' (--action continuous) for an ego that accelerates and steers."
+    raise ValueError(f"The ego acts in {acted}, the environment takes {wanted}{indices}; {advice}")

@@ -85,8 +85,18 @@ def test_an_exported_program_drives_and_a_module_without_forward_names_its_parts
         load_ego("a.pt2")
     exported = wrap_callable(torch.export.load("a.pt2").module())
     np.testing.assert_allclose(exported.predict(seen)[0], expected, atol=1e-6)
-    with pytest.raises(ValueError, match=r"got ModuleDict without; return the part .* \(critic, actor\)"):
-        DrivingProblem("rare_envs/CutIn-v0", ego=agent)
+    for module, part in ((agent, r"the part of it that acts \(critic, actor\), or "), (nn.Module(), "")):
+        with pytest.raises(ValueError, match=rf"got {type(module).__name__} without; return {part}a function from"):
+            DrivingProblem("rare_envs/CutIn-v0", ego=module)
+    called = type("Called", (nn.Module,), {"__call__": lambda self, shown: shown[:, :2] + 1.0})
+    np.testing.assert_array_equal(wrap_callable(called()).predict(seen)[0], seen[:, :2] + 1.0)
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_a_function_that_answers_as_predict_does_is_told_of_one_output(rows: int) -> None:
+    ego = wrap_callable(lambda shown: (np.zeros(len(shown), int), None))
+    with pytest.raises(ValueError, match=r"got 2 outputs; put .*an object with predict"):
+        ego.predict(np.zeros((rows, 11)))
 
 
 @pytest.mark.parametrize("file", ["a.pt", "a.zip", "a.onnx", "a.safetensors", "there/a.pt"])

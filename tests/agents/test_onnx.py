@@ -215,6 +215,28 @@ def test_memories_are_paired_by_their_names(after: tuple[str, str], tmp_path: Pa
     assert (action == 1.0).all()
 
 
+class WithPrevious(nn.Module):
+    """Its second output is no memory, and drives backwards."""
+
+    def forward(self, obs: torch.Tensor, before: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return obs[:, :2] + 0.5 * before + 0.25, obs[:, :2] - 1.0
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("before", ["prev_actions", "last_action", "previous_actions", "actions_in"])
+def test_actions_that_are_their_own_memory_are_the_actions(before: str, tmp_path: Path) -> None:
+    examples, file = (torch.zeros(1, COLUMNS), torch.zeros(1, 2)), tmp_path / "ego.onnx"
+    names = {"input_names": ["obs", before], "output_names": ["actions", "log_std"], "dynamo": False}
+    torch.onnx.export(WithPrevious(), examples, str(file), **names)
+    ego = load_ego(file)
+    first, state = ego.predict(np.zeros((3, COLUMNS)))
+    assert (first == 0.25).all() and (ego.predict(np.zeros((3, COLUMNS)), state)[0] == 0.375).all()
+    torch.onnx.export(WithPrevious(), examples, str(file), **{**names, "output_names": ["next_" + before, "mean"]})
+    if before != "actions_in":  # which of both drives cannot be told
+        with pytest.raises(ValueError, match=f"got next_{before}, mean; export it with one, named actions"):
+            load_ego(file)
+
+
 def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.onnx").write_bytes(b"not a graph")
     with pytest.raises(ValueError, match=r"Cannot load .*broken\.onnx' as ONNX"):

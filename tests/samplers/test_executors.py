@@ -25,6 +25,7 @@ import pytest
 
 import samplers
 from samplers import executors
+from samplers.evaluate import Work
 from samplers.executors import FuturesPool, LocalProcesses, RayCluster
 from tests.samplers.faulty_functions import BAD, FAULTS, KillsItself, matrix, problem
 from tests.samplers.real_executors import LIBRARIES, case, open_executor
@@ -255,6 +256,16 @@ def test_threads_and_jobs_give_the_bits_of_one_process() -> None:
         assert threads.submit(int, 7).result() == 7  # it is the caller's, and goes on
         exits = estimate(problem(FAULTS["exiting"]), FuturesPool(threads, time_limit=1e-9), 60)
     assert "1 simulations gave no outcome" in " ".join(exits.warnings)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [{"_max_workers": 200}, {"num_workers": 200}, {"_client": SimpleNamespace(nthreads=lambda: {"a": 80, "b": 120})}],
+)
+def test_a_pool_tells_its_number_of_workers(told: dict[str, Any]) -> None:
+    pool = SimpleNamespace(submit=Jobs().submit, **told)
+    with FuturesPool(pool).open(Work(problem(matrix), 0.0, "raise", "mc")) as opened:
+        assert opened.workers == 200
 
 
 class Wrong:

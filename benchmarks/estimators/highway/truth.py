@@ -24,7 +24,7 @@ from samplers.sample import clopper_pearson
 
 HIGHWAY_ID = "rare_envs/Highway-v0"
 COUNTED_EGO = str(Path(__file__).with_name("imitation_uncorrected.safetensors"))
-"""The ego `imitation` before its corrections (`training.recipes.imitation`): the one whose failures were counted."""
+"""The ego `imitation` before its corrections (`training.imitation`): the one whose failures were counted."""
 
 
 @dataclass(frozen=True)

@@ -46,12 +46,14 @@ def test_spaces_of_actions() -> None:
     check_spaces(Recorder(action_space=spaces.Discrete(5)), expected)
     check_spaces(Recorder(action_space=spaces.Discrete(5)), expected, "meta")
     check_spaces(Recorder(action_space=spaces.Discrete(5)), expected, "discrete")
-    with pytest.raises(ValueError, match=r"takes Discrete\(5\) \(five accelerations\); choose another"):
+    with pytest.raises(
+        ValueError, match=r"takes Discrete\(5\) \(five accelerations\); take action='continuous' \(--action c"
+    ):
         check_spaces(Recorder(action_space=spaces.Box(-1, 1, (2,))), expected, "discrete")
     for space, kind in ((spaces.Discrete(4), "continuous"), (spaces.MultiDiscrete([2, 2]), "continuous")):
         with pytest.raises(ValueError, match=r"the environment takes Box.* put an object with predict around it"):
             check_spaces(Recorder(action_space=space), expected, kind)
-    with pytest.raises(ValueError, match=r"takes Discrete\(5\) \(LANE_LEFT"):
+    with pytest.raises(ValueError, match=r"takes Discrete\(5\) \(LANE_LEFT.*SLOWER\); take action='continuous'"):
         check_spaces(Recorder(action_space=spaces.Box(-1, 1, (2,))), expected, "meta")
 
 
