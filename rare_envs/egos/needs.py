@@ -106,8 +106,26 @@ class ModuleEgo:
         parameter = next(self.module.parameters(), torch.empty(0))
         shown = map_kinds(lambda part: torch.as_tensor(part).to(parameter), observation)
         with torch.no_grad():
-            actions: torch.Tensor = read_output(self.module(shown))
+            try:
+                actions: torch.Tensor = read_output(self.module(shown))
+            except AssertionError as error:
+                if "Guard failed" not in str(error):
+                    raise
+                words = "Expected a program that was exported with a dynamic batch (dynamic_shapes of torch.export)"
+                raise ValueError(f"{words} for such observations, got one of fixed sizes: {error}.") from None
         return actions
+
+
+def _was_exported_in_training(module: torch.nn.Module) -> bool:
+    """Return whether a program, or one inside, keeps its dropout or the statistics of each batch in evaluation."""
+    programs = (part for part in module.modules() if isinstance(part, torch.fx.GraphModule))
+    for node in (node for program in programs for node in program.graph.nodes):
+        names = [argument.name for argument in getattr(getattr(node.target, "_schema", None), "arguments", ())]
+        given = {**dict(zip(names, node.args, strict=False)), **node.kwargs}
+        trains = given.get("train") is True or given.get("training") is True
+        if trains and given.get("dropout", given.get("p")) != 0:
+            return True
+    return False
 
 
 _ONE_OUTPUT = (
@@ -159,6 +177,8 @@ def wrap_callable(ego: Any) -> Any:
         part = f"the part of it that acts ({parts}), or " if parts else ""
         found = f"{type(ego).__name__} without; return {part}a function from observations to actions"
         raise ValueError(f"Expected a module with forward, got {found}.")
+    if _was_exported_in_training(ego):
+        raise ValueError("Expected a program of evaluation mode, got one of training mode: eval() before torch.export.")
     return ModuleEgo(ego, *declared)
 
 

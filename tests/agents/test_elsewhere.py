@@ -21,6 +21,7 @@ from rare_envs import DrivingProblem, highway_env_problem
 from rare_envs.egos.needs import EgoWarning, wrap_callable
 from rare_envs.study.arguments import Question
 from rare_envs.study.question import digest_files
+from tests.test_docs import blocks
 
 ADAPTER = """
 import torch
@@ -85,11 +86,34 @@ def test_an_exported_program_drives_and_a_module_without_forward_names_its_parts
         load_ego("a.pt2")
     exported = wrap_callable(torch.export.load("a.pt2").module())
     np.testing.assert_allclose(exported.predict(seen)[0], expected, atol=1e-6)
+    one = wrap_callable(torch.export.export(agent["actor"], (torch.zeros(1, 11),)).module())
+    with pytest.raises(ValueError, match=r"^Expected a program .* with a dynamic batch .*Guard failed.*$"):
+        one.predict(seen)
+    for layer, refused in ((nn.Dropout(0.5), True), (nn.BatchNorm1d(2), True), (nn.Dropout(0.0), False)):
+        for training in (True, False):
+            network = nn.Sequential(agent["actor"], layer).train(training)
+            program = torch.export.export(network, (torch.zeros(2, 11),), dynamic_shapes=(rows,))
+            with pytest.raises(ValueError, match=r"eval\(\) bef") if refused and training else nullcontext():
+                wrap_callable(program.module())
     for module, part in ((agent, r"the part of it that acts \(critic, actor\), or "), (nn.Module(), "")):
         with pytest.raises(ValueError, match=rf"got {type(module).__name__} without; return {part}a function from"):
             DrivingProblem("rare_envs/CutIn-v0", ego=module)
     called = type("Called", (nn.Module,), {"__call__": lambda self, shown: shown[:, :2] + 1.0})
     np.testing.assert_array_equal(wrap_callable(called()).predict(seen)[0], seen[:, :2] + 1.0)
+
+
+def test_the_recipe_for_a_memory_has_the_trained_one(seen: Any) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "egos.md").read_text()
+    code = next(block.code for block in blocks(page) if block.code.startswith("# adapter.py"))
+    Path("adapter_of_page.py").write_text(code)
+    lstm, encoder = nn.LSTM(128, 128), nn.Sequential(nn.Linear(11, 128), nn.GELU())
+    policy = nn.ModuleDict({"encoder": encoder, "decoder": nn.Linear(128, 5), "value": nn.Linear(128, 1)})
+    weights = nn.ModuleDict({"policy": policy, "lstm": lstm}).state_dict()  # of PufferLib 3's LSTMWrapper, with cell
+    torch.save(weights | {f"cell.{name[:-3]}": value for name, value in lstm.state_dict().items()}, "policy.pt")
+    ego, memory, shown = load_ego("adapter_of_page:Lstm?file=policy.pt"), None, torch.from_numpy(np.stack([seen] * 3))
+    for row, scores in zip(shown, policy["decoder"](lstm(encoder(shown))[0]), strict=True):
+        actions, memory = ego.predict(row.numpy(), memory, np.zeros(len(row), dtype=bool))
+        assert actions.tolist() == scores.argmax(1).tolist()
 
 
 @pytest.mark.parametrize("rows", [1, 4])
