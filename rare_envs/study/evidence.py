@@ -149,17 +149,22 @@ def read_pointer(content: Mapping[str, Any], pointer: str) -> Any:
     return value
 
 
-def find_changed(folder: Path, files: tuple[str, ...] = ("",)) -> list[str]:
+Digests = dict[Path, str]
+"""SHA-256 digests of results, which do not change while a report is made; what is written with it is not among them."""
+
+
+def find_changed(folder: Path, files: tuple[str, ...] = ("",), known: Digests | None = None) -> list[str]:
     """Return the files of a run, a risk and their evidence that manifest.json has otherwise.
 
     They are relative to the folder; `files` are the beginnings of those that are looked at.
     """
-    filed, found = _read(folder / EVIDENCE / MANIFEST).get("sha256") or {}, _digest_files(folder, files)
+    known = {} if known is None else known
+    filed, found = _read(folder / EVIDENCE / MANIFEST).get("sha256") or {}, _digest_files(folder, files, known)
     names = {name for name in (*filed, *found) if name.startswith(files)}
     return sorted(name for name in names if found.get(name) != filed.get(name))
 
 
-def _digest_files(folder: Path, files: tuple[str, ...] = ("",)) -> dict[str, str]:
+def _digest_files(folder: Path, files: tuple[str, ...], known: Digests) -> dict[str, str]:
     """Return SHA-256 digests of the results of a run, or of a risk and its runs, and of the evidence in its folder."""
     digests, own = dict[str, str](), folder / EVIDENCE / MANIFEST
     results = [each / name for each in (folder, *_list_runs(folder)) for name in (RISK, STUDY, *DIGESTED)]
@@ -167,15 +172,28 @@ def _digest_files(folder: Path, files: tuple[str, ...] = ("",)) -> dict[str, str
     for path in sorted((*results, *filed)):
         name = path.relative_to(folder).as_posix()
         if path.is_file() and path != own and name.startswith(files):
-            with open_ordinary(path) as file:
-                digests[name] = hashlib.sha256(file.read()).hexdigest()
+            digests[name] = known.get(path) or _digest_file(path)
+            if path in results:
+                known[path] = digests[name]
     return digests
+
+
+def _digest_file(path: Path) -> str:
+    """Return the SHA-256 digest of an ordinary file of any size."""
+    digest = hashlib.sha256()
+    with open_ordinary(path) as file:
+        while part := file.read(1 << 20):
+            digest.update(part)
+    return digest.hexdigest()
 
 
 def _list_runs(folder: Path) -> list[Path]:
     """Return the folders of the runs of a risk; none if it is none."""
-    names = _read(folder / RISK).get("scenarios") or () if (folder / RISK).is_file() else ()
-    return [folder / str(name) for name in names]
+    names = [*map(str, _read(folder / RISK).get("scenarios") or ())] if (folder / RISK).is_file() else []
+    for name in names:
+        if Path(name).name != name or (folder / name).resolve().parent != folder.resolve():
+            raise ValueError(f"Expected names of folders in {str(folder)!r} as scenarios of its {RISK}, got {name!r}.")
+    return [folder / name for name in names]
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -202,29 +220,30 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
             f"Expected the folder of rare-envs estimate or risk, got that of a comparison, {str(folder)!r}, whose runs "
             "keep no simulations: evidence is of one ego, from its own rare-envs risk EGO --out FOLDER."
         )
+    known: Digests = {}
     if not (folder / RISK).is_file():
-        return _write_evidence_of_run(folder, trust)[1]
+        return _write_evidence_of_run(folder, trust, known)[1]
     with as_bad_input(OSError, ValueError):
         runs, recorded = _list_runs(folder), _read(folder / RISK)
-        filed = find_changed(folder) if (folder / EVIDENCE / MANIFEST).is_file() else []
-    found = {part.name: _write_evidence_of_run(part, trust) for part in runs}
+        filed = find_changed(folder, known=known) if (folder / EVIDENCE / MANIFEST).is_file() else []
+    found = {part.name: _write_evidence_of_run(part, trust, known) for part in runs}
     reports, out = {name: report for name, (report, _) in found.items()}, folder / EVIDENCE
     with output_folder(out, PAGE, *FILES), as_bad_input(OSError, ValueError, KeyError, TypeError):
         remove_evidence(folder)
         content = describe_sum(folder, recorded, reports, filed)
         title = f"{recorded['ego']} in {' and '.join(map(name_scenario, reports))}"
-        _finish(folder, title, content, build_claims_of_sum(recorded), recorded["text"])
+        _finish(folder, title, content, build_claims_of_sum(recorded), recorded["text"], known)
     names = (PAGE, *content, MANIFEST, PICTURE, SCHEMA_FILE)  # claims among its content by now
     return (*(path for _, files in found.values() for path in files), *(out / name for name in names))
 
 
-def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Report | str, tuple[Path, ...]]:
+def _write_evidence_of_run(folder: Path, trust: bool, known: Digests) -> tuple[Report | str, tuple[Path, ...]]:
     """Write the evidence of one run; return its report, or why that cannot be computed again, and the files."""
     study = load_finished(folder)
     prepared = prepare(open_run(study, trust))
     out = folder / EVIDENCE
     with output_folder(out, PAGE, *FILES, folders=("test_cases",)), as_bad_input(OSError, ValueError):
-        filed = find_changed(folder) if (out / MANIFEST).is_file() else []
+        filed = find_changed(folder, known=known) if (out / MANIFEST).is_file() else []
         remove_evidence(folder)
         rows, report = list_failures(study), compute_again(study, prepared)
         x = [read_row(study.failures, prepared.problem, row) for row in rows]
@@ -239,7 +258,7 @@ def _write_evidence_of_run(folder: Path, trust: bool) -> tuple[Report | str, tup
         }
         question = study.question
         title = f"{question['ego']} in {question['env_id']}"
-        _finish(folder, title, content, build_claims(study.result), study.result.get("text") or [])
+        _finish(folder, title, content, build_claims(study.result), study.result.get("text") or [], known)
     cases = [out / name for case in content[TEST_CASES]["cases"] for name in case["files"]]
     return report, (out / PAGE, *(out / name for name in (*FILES, MANIFEST, PICTURE, SCHEMA_FILE)), *cases)
 
@@ -250,29 +269,30 @@ def _finish(
     content: dict[str, dict[str, Any]],
     nodes: Sequence[Mapping[str, Any]],
     answer: Sequence[str],
+    known: Digests,
 ) -> None:
     """Write the files of the evidence in a folder, its claims, judged by them, and its page."""
     out = folder / EVIDENCE
     for name, value in content.items():
         replace_text(out / name, format_json(to_json_value(value)))
-    _seal(folder)
+    _seal(folder, known)
     content[CLAIMS] = judge_claims(folder, nodes)
     replace_text(out / CLAIMS, format_json(content[CLAIMS]))
     replace_text(out / PICTURE, draw_claims(content[CLAIMS]["nodes"]))
     replace_text(out / SCHEMA_FILE, format_json(SCHEMA))
     replace_text(out / PAGE, render(title, answer, content, (out / PICTURE).read_text(encoding="utf-8")))
-    _seal(folder)
+    _seal(folder, known)
 
 
-def _seal(folder: Path) -> None:
+def _seal(folder: Path, known: Digests) -> None:
     """Write the manifest with the digests of all files as they are now."""
-    replace_text(folder / EVIDENCE / MANIFEST, format_json({"sha256": _digest_files(folder)}))
+    replace_text(folder / EVIDENCE / MANIFEST, format_json({"sha256": _digest_files(folder, ("",), known)}))
 
 
 def digest_manifest(files: Sequence[Path]) -> tuple[str, str]:
     """Return the manifest among evidence files that has digests of all, and its own, which is to be kept elsewhere."""
     path = next(path for path in reversed(files) if path.name == MANIFEST)
-    return str(path), hashlib.sha256(path.read_bytes()).hexdigest()
+    return str(path), _digest_file(path)
 
 
 def list_changes(files: Sequence[Path]) -> list[str]:
@@ -316,7 +336,9 @@ def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
     except BadInput as error:
         return str(error)
     again = study.result.get("repeatability")
-    return replace(report, repeatability=again and Repeatability(**{**again, "largest": again["largest"] or np.inf}))
+    if again is not None:  # a difference that is infinite has no number
+        again = Repeatability(**{**again, "largest": np.inf if again["largest"] is None else again["largest"]})
+    return replace(report, repeatability=again)
 
 
 def list_differences(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:

@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import os
 import re
 import shutil
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.files import digest_file
-from rare_envs.study import Question, prepare, run_into
+from rare_envs.study import BadInput, Question, evidence, prepare, run_into
 from rare_envs.study.evidence import CELLS, EVIDENCE, SCHEMA, find_changed, judge_leaf, write_evidence
 from rare_envs.study.run_folder import COMPARISON, RESULT, RISK, STUDY
 
@@ -22,7 +24,7 @@ from rare_envs.study.run_folder import COMPARISON, RESULT, RISK, STUDY
 def make_run(folder: Path, **settings: object) -> Path:
     asked = {"env_id": "CutIn-v0", "method": "mc", "max_sim": 4_000, "seed": 1, **settings}
     run_into(folder, prepare(Question(**asked)))  # type: ignore[arg-type]
-    write_evidence(folder)
+    write_evidence(folder, trust=bool(settings.get("trust")))
     return folder
 
 
@@ -82,6 +84,50 @@ def test_the_result_follows_from_the_simulations_and_says_so_where_it_does_not(
         assert (status["/computed_again/differing"] == "supported") == (not wanted)
 
 
+def test_the_result_of_a_policy_ego_follows_from_its_simulations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are done again at its end, where they differ by nothing."""
+    (tmp_path / "coasting.py").write_text(
+        "import numpy as np\ndef make(): return lambda seen: np.zeros((len(seen), 2))"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = make_run(tmp_path / "run", ego="coasting:make", max_sim=300, trust=True)
+    assert json.loads((folder / RESULT).read_text(encoding="utf-8"))["repeatability"]["largest"] == 0.0
+    found: Any = read(folder)["validation.json"]
+    assert found["computed_again"]["differing"] == found["changed"] == []
+
+
+def test_large_files_are_read_once_and_in_pieces(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy, asked = shutil.copytree(run, tmp_path / "copy"), list[str]()
+    digest = evidence._digest_file
+
+    def count(path: Path) -> str:
+        asked.append(path.name)
+        return digest(path)
+
+    monkeypatch.setattr(evidence, "_digest_file", count)
+    write_evidence(copy)
+    assert asked.count("episodes.parquet") == 1
+    os.truncate(copy / "episodes.parquet", 128 << 20)
+    tracemalloc.start()
+    assert find_changed(copy) == ["episodes.parquet"]
+    assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["../victim", "..", "", ".", "part/../../victim", "/victim", "link"])
+def test_names_of_runs_outside_the_folder_of_a_risk_are_refused(run: Path, tmp_path: Path, name: str) -> None:
+    victim, folder = shutil.copytree(run, tmp_path / "victim"), tmp_path / "risk"
+    folder.mkdir()
+    (folder / "link").symlink_to(victim)
+    (folder / RISK).write_text(json.dumps({"scenarios": {name: {}}}), encoding="utf-8")
+    (victim / EVIDENCE / "claims.json").write_text("mine", encoding="utf-8")
+    with pytest.raises(BadInput, match=r"Expected names of folders in .*, got ") as refused:
+        write_evidence(folder)
+    assert "\n" not in str(refused.value) and (victim / EVIDENCE / "claims.json").read_text("utf-8") == "mine"
+
+
 def test_a_claim_is_supported_where_all_below_it_is(run: Path) -> None:
     nodes = {node["id"]: node for node in read(run)["claims.json"]["nodes"]}  # type: ignore[attr-defined]
     assert nodes["G1"]["supports"] is None
@@ -127,7 +173,7 @@ def sign_again(folder: Path, change: dict[str, dict[str, object]]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "removed"), [("origin.json", False), ("validation.json", True), ("test_cases/00.xosc", False)]
+    ("name", "removed"), [("validation.json", False), ("validation.json", True), ("test_cases/00.xosc", False)]
 )
 def test_a_changed_file_of_the_evidence_supports_nothing_and_is_named(
     run: Path, tmp_path: Path, cli: Callable[..., Result], name: str, removed: bool
@@ -140,12 +186,14 @@ def test_a_changed_file_of_the_evidence_supports_nothing_and_is_named(
         path.write_text(path.read_text(encoding="utf-8") + " ", encoding="utf-8")
     assert find_changed(copy) == [f"{EVIDENCE}/{name}"]
     used = "test_cases.json" if name.startswith("test_cases/") else name
-    for leaf in (each for each in leaves if each["file"] == f"{EVIDENCE}/{used}"):
+    leaves = [each for each in leaves if each["file"] == f"{EVIDENCE}/{used}" and each["status"] == "supported"]
+    assert leaves
+    for leaf in leaves:
         if removed:
             with pytest.raises(FileNotFoundError):
                 judge_leaf(copy, leaf)
         else:
-            assert judge_leaf(copy, leaf) != "supported"
+            assert judge_leaf(copy, leaf) == "not supported"
     assert cli("report", copy, "--evidence").exit_code == 3
     assert f"no evidence: {EVIDENCE}/{name}." in (copy / EVIDENCE / "evidence.html").read_text(encoding="utf-8")
     manifest = copy / EVIDENCE / "manifest.json"
