@@ -40,6 +40,7 @@ TABLE = (
 )
 COLUMNS = "id, points, width, n_sim, seconds, notes, numbers"
 INSERT = f"INSERT OR IGNORE INTO chunks ({COLUMNS}, digest) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+AMEND = "UPDATE chunks SET notes = ?, digest = ? WHERE id = ?"
 MAGIC, HEADER_SIZE = b"SQLite format 3\0", 100
 HEAD = 0
 """Number of the record that says what the run is, in its notes; chunks have 1 and more."""
@@ -203,6 +204,15 @@ class Journal:
         seconds, text = round(elapsed, 3), json.dumps(notes)
         self._waiting.append(_Row(-1, points, table.shape[1], n_sim, seconds, text, numbers))
         self._write_waiting()
+
+    def amend(self, head: dict[str, Any]) -> None:
+        """Write another head in the place of the one that it has."""
+        row = _Row(HEAD, "", 0, 0, 0.0, json.dumps(head), b"")
+        try:
+            self._connection.execute(AMEND, (row.notes, row.digest, HEAD))
+        except sqlite3.Error as error:
+            raise OSError(errno.EIO, str(error)) from error
+        self.head = head
 
     def flush(self) -> int:
         """Write what is left, and return how many simulations are in the file, if it is still there."""

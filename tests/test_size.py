@@ -11,13 +11,13 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_760,
-    "code lines": 36_700,
+    "package lines": 57_800,
+    "code lines": 36_750,
     "modules": 213,
     "functions": 3_230,
     "classes": 472,
     "import lines, percent of code": 10.5,
-    "test lines": 34_240,
+    "test lines": 34_249,
     "pages": 18,
     "words of pages": 37_150,
     "files entered by an estimate": 43,

@@ -385,6 +385,7 @@ def resume(
                 "are of what it was before. Start again with --force."
             )
         study = prepare(question)
+        writing.note_on_error(journal, question.on_error)
         writing.note_resumption(folder, journal.earlier_seconds)
         if ego is not None and list(list_risks(question)) == ["ego"]:
             note_question(study.question)  # the address is the reader's own

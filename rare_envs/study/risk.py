@@ -31,7 +31,7 @@ from rare_envs.study.plots import save_risk_plot
 from rare_envs.study.question import CHANGEABLE, Study, build_problem, note_question, open_question, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL, RISK
-from rare_envs.study.writing import check_no_results, clear_runs, unwritten_results
+from rare_envs.study.writing import begin_journal, check_no_results, clear_runs, unwritten_results
 from samplers.evaluate import Executor
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
 from samplers.result import list_warnings
@@ -336,7 +336,8 @@ def resume_risk(folder: Path, questions: Mapping[str, Question], whole: Mapping[
         for question in list_asked(whole, {"ego": whole["ego"]}):
             open_question(asdict(question), folder, trust)
         options = {**whole["options"], "trust": trust, "core": first.core, "device": first.device}
-        options |= {"on_error": how["on_error"]} if how["on_error"] else {}
+        known = (question.on_error for question in questions.values())  # one may have gone on alone, by another
+        options["on_error"] = how["on_error"] or max(known, key=lambda each: each != "raise")
         return _risk(whole["ego"], dict(whole), whole["bases"], folder, True, False, executor, options)
 
 
@@ -389,8 +390,11 @@ def _risk(
             clear_runs({folder / name: study.question for name, study in zip(fitting, studies, strict=True)})
         elif folder is not None:  # all of them, before the first one is run
             check_no_results(folder, RISK)
-            for part in (folder / name for name in fitting if not (folder / name / JOURNAL).exists()):
-                check_no_results(part)
+            for part, study in ((folder / name, study) for name, study in zip(fitting, studies, strict=True)):
+                if not (part / JOURNAL).exists():
+                    check_no_results(part)
+                elif named:  # wherever it is stopped, all go on by the on_error of now
+                    begin_journal(part, study.question, whole=whole).close()
         done: list[ScenarioRisk] = []
         for study in studies:
             try:

@@ -26,7 +26,15 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import digest_file, format_json, replace_file, replace_text
 from rare_envs.startup import __version__
 from rare_envs.study import run_folder
-from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, output_folder, read_question
+from rare_envs.study.arguments import (
+    BadInput,
+    Question,
+    RunInterrupted,
+    UnwrittenResults,
+    as_bad_input,
+    output_folder,
+    read_question,
+)
 from rare_envs.study.episodes import MAX_SHOWN, list_columns
 from rare_envs.study.plots import SEVERE, save_pictures, saved_figure
 from rare_envs.study.question import (
@@ -87,9 +95,18 @@ def _continue_same(folder: Path, head: dict[str, Any]) -> Journal:
     """Return the journal of an unfinished run of the question and files of a head, in the batches of its beginning."""
     journal, _ = continue_journal(folder)
     if _of_any_chunk(journal.head) == _of_any_chunk(json.loads(json.dumps(head))):
+        note_on_error(journal, head["question"]["on_error"])
         return journal
     journal.close()
     raise BadInput(f"The run in {str(folder)!r} is of another question, or of other files: replace it by --force.")
+
+
+def note_on_error(journal: Journal, on_error: str) -> None:
+    """Note in a journal how faults count from now on, so that a later resumption counts them so too."""
+    asked = journal.head["question"]
+    if asked.get("on_error") != on_error:
+        with as_bad_input(OSError):
+            journal.amend({**journal.head, "question": {**asked, "on_error": on_error}})
 
 
 def _of_any_chunk(head: Mapping[str, Any]) -> dict[str, Any]:

@@ -158,8 +158,8 @@ def fit_command(
 def _name_scenario(path: Path) -> str:
     """Return the id of the scenario whose parameters a traffic model has, as it is typed."""
     names = json.loads(path.read_text(encoding="utf-8"))["names"]
-    (found,) = (each for each in SCENARIOS if [p.name for p in find_scenario(each).parameters] == names)
-    return found.removeprefix("rare_envs/")
+    same = (each for each in SCENARIOS if [p.name for p in find_scenario(each).parameters] == names)
+    return next(same, "SCENARIO").removeprefix("rare_envs/")
 
 
 @command(*options.SCENARIO, *EGO_FILE, "trust")

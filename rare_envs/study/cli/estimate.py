@@ -335,9 +335,10 @@ def resume_command(
     folder, whole, questions = writing.find_whole(run, mend)
     command = whole.get("command", "")
     if wrong := ("--ego" if whole and ego else "--on-error" if on_error and command not in ("", "risk") else ""):
+        first = "start the ego again at the address that it had, and " if ego else ""
         raise BadInput(
             f"{wrong} is for a run of one scenario{'' if ego else ', or a risk'}, and {str(run)!r} is of {command}: "
-            f"resume it without{', the ego at the address that it had' if ego else ''}, or begin again with --force."
+            f"{first}resume it without, or begin again with --force."
         )
     if not whole:
         return tell(evaluate.resume(run, ego, on_error, trust, progress=True, executor=executor), run, details)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import rare_envs
@@ -19,7 +23,7 @@ from rare_envs.study.report import Report, judge_rate
 from rare_envs.study.run_folder import JOURNAL
 from tests.rare_envs.study.fitted_files import write_fitted, write_stratified
 from tests.rare_envs.study.forked_command import ForkedCommand
-from tests.rare_envs.study.refusals import Cli, assert_refused
+from tests.rare_envs.study.refusals import Cli, act_after, assert_refused, in_file
 
 BRAKE = "rare_envs/HardBrake-v0"
 
@@ -107,22 +111,80 @@ class Picky:
 
 
 @pytest.mark.slow
-def test_a_risk_whose_ego_fails_goes_on_with_another_on_error(
-    here: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        (("risk", "picky:Picky", "--scenario", "hard_brake"), "risk.json"),
+        (("estimate", BRAKE, "--ego", "picky:Picky"), "result.json"),
+    ],
+)
+def test_a_resumed_run_counts_faults_as_it_did_before_or_as_it_is_told(
+    words: tuple[str, ...], file: str, here: Path, brakings: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its answer is that of a risk that counted so from the beginning."""
+    """Wherever it was stopped, its answer is that of an undisturbed one that counted so from the beginning."""
     (here / "picky.py").write_text(PICKY)
     monkeypatch.setattr(DrivingProblem, "tile", 20)
-    asked = ("--scenario", "hard_brake", "--base", f"hard_brake={brakings}", "--method", "mc", "--max-sim", "60")
-    words = ("risk", "picky:Picky", *asked, "--out")
-    assert_refused(cli(*words, "run"), "failed twice", "rare-envs resume run")
-    assert_refused(cli("resume", "run", "--ego", "tcp://localhost:5"), "--ego is for a run of one scenario")
-    assert cli("resume", "run", "--on-error", "failure").exit_code in (0, 3)
-    (here / "how.yaml").write_text("on_error: failure\n")
-    assert cli(*words, "whole", "--config", "how.yaml").exit_code in (0, 3)
-    found, whole = (answer(here / name, "risk.json") for name in ("run", "whole"))
-    rate = whole["scenarios"]["hard_brake"]["p"]
-    assert found["scenarios"]["hard_brake"]["p"] == rate > 0 and found["text"] == whole["text"]
+    base = f"hard_brake={brakings}" if words[0] == "risk" else brakings
+    words, counted = (*words, "--base", base, "--method", "mc", "--max-sim", "60", "--out"), in_file(on_error="failure")
+    assert cli(*words, "whole", *counted).exit_code in (0, 3)
+    assert_refused(cli(*words, "told"), "failed twice", "rare-envs resume told")
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    for folder, command in (
+        ("told", ("resume", "told", "--on-error", "failure")),
+        ("begun", (*words, "begun", *counted)),
+    ):
+        with monkeypatch.context() as patch:
+            act_after(30, stop, patch)
+            stopped = cli(*command)
+        assert stopped.exit_code == 130 and f"go on with: rare-envs resume {folder}\n" in stopped.stderr
+        assert cli("resume", folder).exit_code in (0, 3)
+        found, whole = (answer(here / name, file) for name in (folder, "whole"))
+        assert found["text"] == whole["text"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [("risk",), ("compare", "idm")])
+def test_a_sum_whose_remote_ego_has_moved_does_what_is_advised(
+    words: tuple[str, ...], here: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is resumed with the ego at its address again, or begun again at another one."""
+    remote = pytest.importorskip("agents.remote", reason="the extra remote is optional")
+
+    @contextlib.contextmanager
+    def serve(address: str = "tcp://127.0.0.1:*") -> Iterator[str]:
+        with remote.EgoServer(Still(), address) as server:
+            thread = threading.Thread(target=server.run)
+            thread.start()
+            yield server.address
+            server.stop()
+            thread.join()
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(DrivingProblem, "tile", 20)
+    command, *rest = words
+    rest += ["--method", "mc", "--max-sim", "60", "--seed", "1", "--out", "run"]
+    with serve() as first, monkeypatch.context() as patch:
+        act_after(30, stop, patch)
+        assert cli(command, first, *rest).exit_code == 130
+    with serve() as moved:
+        refused = cli("resume", "run", "--ego", moved)
+        assert_refused(refused, "start the ego again at the address that it had", "resume it without", "--force")
+    with serve(first):
+        assert cli("resume", "run").exit_code in (0, 3)
+    with serve() as moved:
+        assert cli(command, moved, *rest, "--force").exit_code in (0, 3)
+
+
+class Still:
+    """An ego that neither brakes nor steers."""
+
+    def predict(self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True) -> Any:
+        return np.zeros((len(seen), 2)), None
 
 
 def test_the_page_of_a_sum_names_its_parts_and_its_events(tmp_path: Path, brakings: str) -> None:

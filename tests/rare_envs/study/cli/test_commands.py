@@ -22,7 +22,7 @@ import rare_envs
 import samplers
 import training.fit.recordings as fitting
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
-from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.startup import advise_install
 from rare_envs.study.cli.egos_and_runs import FAILS
 from rare_envs.study.cli.listing import TITLES
@@ -145,12 +145,12 @@ def test_an_ego_is_trained_in_all_scenarios_of_risk(cli: Cli, tmp_path: Path) ->
 
 def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: dict[str, Any] = {}
-    file = tmp_path / "car_following_own.json"
+    file, names = tmp_path / "car_following_own.json", ["ego_speed", "lead_speed", "gap"]
 
     def fit(recordings: Any, out: Path, **options: Any) -> list[Path]:
         asked.update(options, kind=recordings.kind_and_path()[0], between=recordings.between)
         print("progress")
-        file.write_text(json.dumps({"names": ["ego_speed", "lead_speed", "gap"]}))
+        file.write_text(json.dumps({"names": names}))
         return [out / file.name]
 
     monkeypatch.setattr(fitting, "fit_bases", fit)
@@ -160,7 +160,10 @@ def test_the_files_that_were_fitted_are_the_answer(cli: Cli, monkeypatch: pytest
     assert "progress" in answer.stderr
     given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["car_following"], "n_refits": 3}
     assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True, "force": False}
-    assert cli("fit", *words, "--force").stdout == f"{file}: rare-envs estimate CarFollowing-v0 --base {file}\n"
+    monkeypatch.setitem(SCENARIOS, "mine/LongFollowing-v0", replace(find_scenario("car_following"), horizon=20.0))
+    for known in ("CarFollowing-v0", "SCENARIO"):
+        assert cli("fit", *words, "--force").stdout == f"{file}: rare-envs estimate {known} --base {file}\n"
+        names[:] = ["of none"]
 
 
 def test_an_ego_is_checked_in_the_traffic_that_is_asked_for(cli: Cli) -> None:
