@@ -349,7 +349,7 @@ def run_into(
             study = use_batches_of(journal, study)
             writing.note_resumption(folder, journal.earlier_seconds)
         else:
-            writing.begin_study_file(folder, study)
+            writing.begin_study_file(folder, study, (whole or {}).get("scenarios"))
         with _keeping(folder, study, journal, bool(whole)) as target:
             return _finish(target, run(study, progress, journal, executor, target), journal, keep=bool(whole))
 

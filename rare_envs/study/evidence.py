@@ -30,6 +30,8 @@ from scipy.stats import poisson
 
 from rare_envs.files import format_json, open_ordinary, parse_json_object, read_text_file, replace_text
 from rare_envs.plugins import clean_text
+from rare_envs.scenarios.registry import env_id_of, find_scenario
+from rare_envs.simulation.terms import EpisodeTerms
 from rare_envs.startup import __version__
 from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
 from rare_envs.study.episodes import (
@@ -49,6 +51,7 @@ from rare_envs.study.risk import Risk, ScenarioRisk
 from rare_envs.study.run_folder import COMPARISON, DIGESTED, EVIDENCE, RESULT, RISK, STUDY, LoadedStudy, load_finished
 from rare_envs.study.text import describe_kind, format_probability, format_rate, name_scenario, report_as_json
 from rare_envs.study.writing import remove_evidence
+from samplers.evaluate import find_changed as find_differing
 from samplers.output import to_json_value
 from samplers.problem import EvaluationError, FloatArray
 
@@ -80,6 +83,9 @@ NOT_COMPUTED = ("seconds", "earlier_seconds", "n_retried", "faults", "question",
 """What a result has beside what follows from its simulations."""
 FACTOR = "Its contacts are {:.2g} times the nearest end of people's interval (1: inside); nothing was multiplied by it."
 """How the human driver model compares with people."""
+AGAIN = f"{RESULT} computed again by the method from the simulations recorded; terms of method series simulated again"
+SUM_AGAIN = f"{RISK} computed again from its runs; the spread between sites is taken as recorded"
+"""What is computed again."""
 CHECK_TAIL = 0.025
 """A recorded count is outside what the traffic model expects if a count as extreme has a smaller probability."""
 
@@ -307,6 +313,7 @@ class _Recorded:
         table = study.episodes([*name_columns(problem.space), "f"])
         keys, f = digest_scenarios(read_scenarios(table, problem.space)), table["f"].to_numpy()
         self._problem, self._f = problem, dict(zip(keys, f.tolist(), strict=True))
+        self.n_terms, self.largest = 0, list[float]()
 
     def __getattr__(self, name: str) -> Any:
         """Return what the problem has."""
@@ -319,11 +326,20 @@ class _Recorded:
         except KeyError:
             raise EvaluationError("the method asks for simulations that the run does not have") from None
 
+    def terms(self, x: FloatArray, gamma: float = 0.0) -> EpisodeTerms:
+        """Return the terms of scenarios x of the run, which are simulated again; f that differ are kept in mind."""
+        f, found = self.evaluate(x), self._problem.terms(x, gamma)
+        changed = find_differing(found.f, f)
+        self.n_terms += len(x)
+        self.largest += np.nan_to_num(np.abs(found.f - f)[changed], nan=np.inf).tolist()
+        return found
+
 
 def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
     """Return the report that the method gives with the simulations of a run, or why there is none.
 
-    Nothing is simulated but failures, for what they are like. Another processor or version of a library may round
+    Nothing is simulated but failures, for what they are like, and the terms and gradients of method series, whose f are
+    compared with the recorded ones. Another processor or version of a library may round
     otherwise, so that a method goes another way, and asks for other simulations.
     """
     if not study.episodes_path.is_file():
@@ -336,6 +352,8 @@ def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
     except BadInput as error:
         return str(error)
     again = study.result.get("repeatability")
+    if problem.largest:
+        again = {"n": problem.n_terms, "n_differing": len(problem.largest), "largest": max(problem.largest)}
     if again is not None:  # a difference that is infinite has no number
         again = Repeatability(**{**again, "largest": np.inf if again["largest"] is None else again["largest"]})
     return replace(report, repeatability=again)
@@ -358,10 +376,9 @@ def _agree(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _describe_again(file: str, differing: list[str] | None, reason: str) -> dict[str, Any]:
+def _describe_again(what: str, differing: list[str] | None, reason: str) -> dict[str, Any]:
     """Return what was found by computing a result again."""
-    about = {"what": f"{file} computed again by the method from the simulations recorded"}
-    return {**about, "differing": differing, "reason": reason}
+    return {"what": what, "differing": differing, "reason": reason}
 
 
 def list_failures(study: LoadedStudy) -> list[int]:
@@ -493,7 +510,7 @@ def validate(
             "tolerance": REPLAY_TOLERANCE,
         },
         "simulators": compare_simulators(prepared, [read_row(study.failures, prepared.problem, row) for row in rows]),
-        "computed_again": _describe_again(RESULT, differing, again if isinstance(again, str) else ""),
+        "computed_again": _describe_again(AGAIN, differing, again if isinstance(again, str) else ""),
         "warnings": list(dict.fromkeys(warnings)),
         "files_changed": study.changed_files if study.about.get("results") else None,
         "changed": list(dict.fromkeys([*study.changed_files, *forged, *filed])),
@@ -617,8 +634,11 @@ def describe_sum(
         {name: part[key] for name, part in parts.items()} for key in (COVERAGE, UNCERTAINTY, VALIDATION, ORIGIN)
     )
     cells = [cell for each in coverage.values() for cell in each["iso_34502"]["covered"]]
-    differing, reason = add_again(recorded, reports)
-    forged = [f"{RISK} ({', '.join(differing)})"] if differing else []
+    dropped = find_dropped(folder, recorded)
+    left_out = {**recorded["left_out"], **dropped}
+    differing, reason = add_again(recorded, reports, left_out)
+    names = differing or ["left_out"][: len(dropped)]
+    forged = [f"{RISK} ({', '.join(names)})"] if names else []
     changed = [f"{name}/{file}" for name, each in validation.items() for file in each["changed"]]
     whole = recorded["per_million_km"]
     rates = [
@@ -638,7 +658,7 @@ def describe_sum(
             **{key: first[COVERAGE][key] for key in ("statement", "also_not_covered", "counted")},
             "scenarios": {name: f"{name}/{EVIDENCE}/{COVERAGE}" for name in parts},
             "iso_34502": {"covered": cells, "not_covered": [cell for cell in CELLS if cell not in cells]},
-            "left_out": recorded["left_out"],
+            "left_out": left_out,
         },
         UNCERTAINTY: {
             **{key: recorded[key] for key in ("per_million_km", "interval_per_million_km", "confidence")},
@@ -649,7 +669,7 @@ def describe_sum(
             "left_out": first[UNCERTAINTY]["left_out"],
         },
         VALIDATION: {
-            "computed_again": _describe_again(RISK, differing, reason),
+            "computed_again": _describe_again(SUM_AGAIN, differing, reason),
             "warnings": recorded["warnings"],
             "changed": list(dict.fromkeys([*forged, *changed, *filed])),
         },
@@ -657,10 +677,22 @@ def describe_sum(
     }
 
 
-def add_again(recorded: Mapping[str, Any], reports: Mapping[str, Report | str]) -> tuple[list[str] | None, str]:
+def find_dropped(folder: Path, recorded: Mapping[str, Any]) -> dict[str, str]:
+    """Return scenarios that risk.json does not name, by name: their runs lie there, or its runs say they were asked."""
+    runs = [path.parent.name for path in folder.glob(f"*/{STUDY}")]
+    asked = [name for run in recorded["scenarios"] for name in _read(folder / run / STUDY).get("scenarios") or ()]
+    # code that a folder names is not imported for its name
+    names = {*runs, *(find_scenario(env_id_of(str(name).rpartition(":")[2])).name for name in asked)}
+    missing = sorted(names - {*recorded["scenarios"], *recorded["left_out"]})
+    return dict.fromkeys(missing, f"it is in the folder, or was asked for, and {RISK} does not have it")
+
+
+def add_again(
+    recorded: Mapping[str, Any], reports: Mapping[str, Report | str], left_out: Mapping[str, str]
+) -> tuple[list[str] | None, str]:
     """Return what of risk.json is not the sum of the reports of its runs, by name; or None, and why it is not known.
 
-    The spread between sites is taken as recorded.
+    The spread between sites is taken as recorded; `left_out` are all scenarios that were asked for and are not in it.
     """
     done, kept = list[ScenarioRisk](), {name: dict(part) for name, part in recorded["scenarios"].items()}
     for name, report in reports.items():
@@ -668,7 +700,7 @@ def add_again(recorded: Mapping[str, Any], reports: Mapping[str, Report | str]) 
             return None, f"{name_scenario(name)}: {report if isinstance(report, str) else report.no_rate}"
         rate = replace(report.rate, site_log_sd=kept[name]["site_log_sd"])
         done.append(ScenarioRisk(report=report, rate=rate, site_factors=kept[name]["site_factors"]))
-    again = Risk(ego=recorded["ego"], scenarios=tuple(done), left_out=recorded["left_out"]).to_dict()
+    again = Risk(ego=recorded["ego"], scenarios=tuple(done), left_out=left_out).to_dict()
     for part in (*kept.values(), *again["scenarios"].values()):
         part.pop("report", None)  # which its own evidence compares
     return list_differences({**recorded, "scenarios": kept}, again), ""
@@ -716,7 +748,7 @@ def build_claims_of_sum(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
     goals["S2 Argue over the sum"] = [
         *([("The limit is met", RISK, "/gate/decision", "passes")] if gate else []),
-        ("No scenario that was asked for is left out", RISK, "/left_out", {}),
+        ("No scenario that was asked for is left out", COVERAGE, "/left_out", {}),
         ("Recorded events limit each rate", UNCERTAINTY, "/limited", True),
         ("The sum is that of its runs", VALIDATION, "/computed_again/differing", []),
         ("The files are those that were filed", VALIDATION, "/changed", []),

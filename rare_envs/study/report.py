@@ -203,10 +203,11 @@ class Repeatability(NamedTuple):
         return ""
 
 
-def judge_rate(limit: float, rate: CollisionRate | TotalRate, reason: str) -> samplers.analysis.Verdict:
-    """Return whether a rate is below a limit; undecided for a reason, if there is one."""
-    rates = rate.rates if isinstance(rate, TotalRate) else (rate,)
-    about = {"quantity": "collisions per million km", "includes_base": all(each.base_log_sd > 0 for each in rates)}
+def judge_rate(
+    limit: float, rate: CollisionRate | TotalRate, reason: str, includes_base: bool
+) -> samplers.analysis.Verdict:
+    """Return whether a rate is below a limit, its traffic model's error judged or not; undecided for a reason."""
+    about: dict[str, Any] = {"quantity": "collisions per million km", "includes_base": includes_base}
     return judge_ends(limit, rate.interval_per_million_km, rate.confidence, reason, **about)
 
 
@@ -334,23 +335,26 @@ class Report:
     def verdict(self) -> samplers.analysis.Verdict | None:
         """Whether p, or the rate, is below the limit of the question; None without a limit."""
         question = self.study.question
-        if question.max_rate is not None:
-            if_exact = self._judge_rate(question.max_rate, True).decision
-            found = self._judge_rate(question.max_rate, question.assume_traffic)
-            return replace(found, if_exact=None if question.assume_traffic else if_exact)
-        if question.max_p is None:
+        if question.max_rate is None and question.max_p is None:
             return None
-        found = self.estimate.meets(question.max_p, question.assume_traffic)
-        return replace(found, decision="undecided", reason=self.indecision) if self.indecision else found
+        found = self._judge(question.assume_traffic)
+        return replace(found, if_exact=self._judge(True).decision if found.includes_base else None)
 
-    def _judge_rate(self, limit: float, assume_traffic: bool) -> samplers.analysis.Verdict:
-        return judge_rate(limit, self.find_judged_rate(assume_traffic), self.indecision)
+    def _judge(self, assume_traffic: bool) -> samplers.analysis.Verdict:
+        limit, reason = self.study.question.max_rate, self.find_indecision(assume_traffic)
+        if limit is not None:
+            rate, judged = self.find_judged_rate(assume_traffic), self.judges_traffic(assume_traffic)
+            return judge_rate(limit, rate, reason, judged)
+        found = self.estimate.meets(self.study.question.max_p, assume_traffic)
+        return replace(found, decision="undecided", reason=reason) if reason else found
 
-    @property
-    def indecision(self) -> str:
-        """Why nothing can be said of any limit; empty if something can."""
-        said = self.estimate.meets(0.5, self.study.question.assume_traffic).reason
-        return said or find_doubt(self.doubts_of_f)
+    def judges_traffic(self, assume_traffic: bool) -> bool:
+        """Return whether a verdict takes the error of the traffic model into account."""
+        return not assume_traffic and self.estimate.base_uncertainty is not None
+
+    def find_indecision(self, assume_traffic: bool) -> str:
+        """Return why nothing can be said of any limit, if traffic is taken as exact or not; empty if something can."""
+        return self.estimate.meets(0.5, assume_traffic).reason or find_doubt(self.doubts_of_f)
 
     def find_judged_rate(self, assume_traffic: bool) -> CollisionRate:
         """Return the rate whose ends are compared with a limit: with the errors of the base, or taken as exact."""

@@ -189,15 +189,18 @@ class Risk:
         if limit is None:
             return None
         missing = [f"{text.name_scenario(name)} is left out" for name in self.left_out]
-        reason = next(filter(None, [*missing, *(each.report.indecision for each in self.scenarios)]), "")
+        reports = [each.report for each in self.scenarios]
 
         def judge(assume_traffic: bool) -> samplers.analysis.Verdict:
+            doubts = (each.find_indecision(assume_traffic) for each in reports)
+            reason = next(filter(None, [*missing, *doubts]), "")
             found = [(each.report.find_judged_rate(assume_traffic), each.rate.site_log_sd) for each in self.scenarios]
             rates = tuple(replace(rate, site_log_sd=spread) for rate, spread in found)
-            return judge_rate(limit, exposure.TotalRate(rates), reason)
+            judged = all(each.judges_traffic(assume_traffic) for each in reports)
+            return judge_rate(limit, exposure.TotalRate(rates), reason, judged)
 
-        assumed = self.scenarios[0].report.study.question.assume_traffic
-        return replace(judge(assumed), if_exact=None if assumed else judge(True).decision)
+        verdict = judge(reports[0].study.question.assume_traffic)
+        return replace(verdict, if_exact=judge(True).decision if verdict.includes_base else None)
 
     @property
     def warnings(self) -> tuple[str, ...]:

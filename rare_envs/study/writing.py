@@ -346,10 +346,13 @@ LIBRARIES = "cvxpy gymnasium highway-env numba numpy onnxruntime scikit-learn sc
 """Distributions whose versions may change a number."""
 
 
-def begin_study_file(folder: Path, study: Study) -> None:
-    """Write study.json of a run that begins, in place of the files of an earlier one, and note that it was asked."""
+def begin_study_file(folder: Path, study: Study, scenarios: Sequence[str] | None = None) -> None:
+    """Write study.json of a run that begins, in place of the files of an earlier one, and note that it was asked.
+
+    Of a part of a sum it has the scenarios of all, as they were asked for.
+    """
     _remove_results(folder)
-    _write_study_file(folder, describe_study(study))
+    _write_study_file(folder, describe_study(study) | ({"scenarios": [*scenarios]} if scenarios else {}))
     note_question(study.question)
 
 

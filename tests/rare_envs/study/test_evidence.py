@@ -12,6 +12,8 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import jsonschema
+import pyarrow.compute
+import pyarrow.parquet
 import pytest
 from typer.testing import Result
 
@@ -96,6 +98,18 @@ def test_the_result_of_a_policy_ego_follows_from_its_simulations(
     assert json.loads((folder / RESULT).read_text(encoding="utf-8"))["repeatability"]["largest"] == 0.0
     found: Any = read(folder)["validation.json"]
     assert found["computed_again"]["differing"] == found["changed"] == []
+
+
+def test_terms_that_are_simulated_again_are_compared_with_the_recorded_f(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", env_id="CarFollowing-v0", method="series", max_sim=600)
+    table = pyarrow.parquet.read_table(folder / "episodes.parquet")
+    assert read(folder)["validation.json"]["computed_again"]["differing"] == []  # type: ignore[index]
+    safe = pyarrow.compute.add(table["f"], 5.0)
+    table = table.set_column(table.column_names.index("f"), "f", safe)
+    pyarrow.parquet.write_table(table, folder / "episodes.parquet")
+    with pytest.warns(UserWarning, match=r"episodes\.parquet"):
+        write_evidence(folder)
+    assert "repeatability" in read(folder)["validation.json"]["computed_again"]["differing"]  # type: ignore[index]
 
 
 def test_large_files_are_read_once_and_in_pieces(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,6 +300,14 @@ def test_a_report_files_the_evidence_of_each_run_of_a_risk_and_of_the_sum(
     answer = cli("report", folder, "--evidence", "--json")
     assert answer.exit_code == 3
     assert json.loads(answer.stdout)["changed"] == [f"{RISK} (interval_per_million_km)", RISK]
+    del recorded["scenarios"]["hard_brake"]  # the run lies there still; then only the other one says it was asked for
+    for removed in (False, True):
+        (folder / RISK).write_text(json.dumps(recorded), encoding="utf-8")
+        if removed:
+            shutil.rmtree(folder / "hard_brake")
+        assert "left_out" in json.loads(cli("report", folder, "--evidence", "--json").stdout)["changed"][0]
+        leaves = {leaf["pointer"]: leaf["status"] for leaf in list_leaves(folder)}
+        assert leaves["/left_out"] == "not supported" and "hard_brake" in str(read(folder)["coverage.json"])
 
 
 ISO = ("cut-in", "deceleration")
