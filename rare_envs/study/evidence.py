@@ -328,7 +328,8 @@ class _Recorded:
 
     def terms(self, x: FloatArray, gamma: float = 0.0) -> EpisodeTerms:
         """Return the terms of scenarios x of the run, which are simulated again; f that differ are kept in mind."""
-        f, found = self.evaluate(x), self._problem.terms(x, gamma)
+        f = self.evaluate(x)
+        found: EpisodeTerms = self._problem.terms(x, gamma)
         changed = find_differing(found.f, f)
         self.n_terms += len(x)
         self.largest += np.nan_to_num(np.abs(found.f - f)[changed], nan=np.inf).tolist()

@@ -345,7 +345,7 @@ class Report:
         if limit is not None:
             rate, judged = self.find_judged_rate(assume_traffic), self.judges_traffic(assume_traffic)
             return judge_rate(limit, rate, reason, judged)
-        found = self.estimate.meets(self.study.question.max_p, assume_traffic)
+        found = self.estimate.meets(self.study.question.max_p or 0.0, assume_traffic)
         return replace(found, decision="undecided", reason=reason) if reason else found
 
     def judges_traffic(self, assume_traffic: bool) -> bool:
