@@ -65,8 +65,6 @@ _NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 _PPO = {**_ON_POLICY, "n_steps": 16, "batch_size": 2048, "n_epochs": 5, "clip_range": 0.4, "learning_rate": 2e-3}
 _PPO_POLICY = {**_ACTOR_CRITIC, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
 _A2C = {**_ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
-# A target that follows faster makes up for half of the updates.
-_SAC = {**_OFF_POLICY, "batch_size": 512, "gradient_steps": 4, "learning_rate": 2e-3, "tau": 0.02}
 _DQN = {
     **_OFF_POLICY,
     "gradient_steps": 4,
@@ -78,7 +76,7 @@ HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
         "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02, num_envs=512),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
-        "sac": Hyperparameters(_SAC, _NETS),
+        "sac": Hyperparameters(_OFF_POLICY, _NETS),
         "td3": Hyperparameters(_OFF_POLICY, _NETS, noise=0.2),
         "dqn": Hyperparameters(_DQN, _NETS, discrete=True),
     }
