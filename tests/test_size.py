@@ -11,9 +11,9 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_800,
-    "code lines": 36_750,
-    "modules": 213,
+    "package lines": 57_850,
+    "code lines": 36_780,
+    "modules": 214,
     "functions": 3_230,
     "classes": 472,
     "import lines, percent of code": 10.5,

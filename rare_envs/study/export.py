@@ -264,13 +264,7 @@ def write_story(
         if j or not free_ego:
             act.add_maneuver_group(follow(name, actor, j))
     end = after(float(moments.time[-1]), "end", "stop", xosc.Rule.greaterThan)
-    if carla:  # scenario_runner takes a condition of this name for a criterion, and reports whether the ego collided
-        collision = xosc.ParameterCondition("", "", xosc.Rule.lessThan)
-        stop = xosc.ConditionGroup("stop")
-        stop.add_condition(end)
-        criterion = "criteria_CollisionTest"
-        stop.add_condition(xosc.ValueTrigger(criterion, 0, xosc.ConditionEdge.rising, collision, "stop"))
-    board, header = xosc.StoryBoard(init, stop if carla else end), xosc.Properties()
+    board, header = xosc.StoryBoard(init, _watch_collisions(xosc, end) if carla else end), xosc.Properties()
     board.add_act(act)
     for name, value in properties.items():
         header.add_property(name, value)
@@ -283,6 +277,15 @@ def write_story(
     )
     with replace_file(path) as draft:
         scenario.write_xml(str(draft))
+
+
+def _watch_collisions(xosc: Any, end: Any) -> Any:
+    """Return the end of a story with a criterion of CARLA's scenario_runner: whether the ego collided."""
+    collision, stop = xosc.ParameterCondition("", "", xosc.Rule.lessThan), xosc.ConditionGroup("stop")
+    stop.add_condition(end)
+    # it takes a condition of this name for a criterion
+    stop.add_condition(xosc.ValueTrigger("criteria_CollisionTest", 0, xosc.ConditionEdge.rising, collision, "stop"))
+    return stop
 
 
 def _make_vehicle(xosc: Any, actor: str, centre: float, carla: bool) -> Any:

@@ -18,7 +18,7 @@ import pytest
 from typer.testing import Result
 
 from rare_envs.files import digest_file
-from rare_envs.study import BadInput, Question, evidence, prepare, run_into
+from rare_envs.study import BadInput, Question, claims, prepare, run_into
 from rare_envs.study.evidence import CELLS, EVIDENCE, SCHEMA, find_changed, judge_leaf, write_evidence
 from rare_envs.study.run_folder import COMPARISON, RESULT, RISK, STUDY
 
@@ -114,13 +114,13 @@ def test_terms_that_are_simulated_again_are_compared_with_the_recorded_f(tmp_pat
 
 def test_large_files_are_read_once_and_in_pieces(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy, asked = shutil.copytree(run, tmp_path / "copy"), list[str]()
-    digest = evidence._digest_file
+    digest = claims.digest_file
 
     def count(path: Path) -> str:
         asked.append(path.name)
         return digest(path)
 
-    monkeypatch.setattr(evidence, "_digest_file", count)
+    monkeypatch.setattr(claims, "digest_file", count)
     write_evidence(copy)
     assert asked.count("episodes.parquet") == 1
     os.truncate(copy / "episodes.parquet", 128 << 20)
