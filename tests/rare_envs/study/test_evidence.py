@@ -59,9 +59,9 @@ def list_leaves(folder: Path) -> list[dict[str, Any]]:
 def test_the_files_have_the_fields_of_the_schema_and_no_others(run: Path) -> None:
     content = read(run)
     jsonschema.validate(content, SCHEMA)
-    for claims in ({}, {**content["claims.json"], "more": 1}):
+    for other in ({}, {**content["claims.json"], "more": 1}):
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate({**content, "claims.json": claims}, SCHEMA)
+            jsonschema.validate({**content, "claims.json": other}, SCHEMA)
 
 
 def test_each_leaf_is_judged_again_from_its_file(run: Path) -> None:
