@@ -63,10 +63,10 @@ class JournalInUse(JournalError):
 class _Damaged(JournalError):
     """A record does not match its digest."""
 
-    def __init__(self, path: Path, number: int = HEAD) -> None:
+    def __init__(self, path: Path, number: int = HEAD, how: str = "") -> None:
         self.number = number
         where = f": record {number + 1} does" if number > HEAD else " from its first record on, which does"
-        super().__init__(f"{str(path)!r} is damaged{where} not match its checksum.")
+        super().__init__(f"{str(path)!r} is damaged{how or f'{where} not match its checksum'}.")
 
 
 class _Row(NamedTuple):
@@ -282,9 +282,9 @@ def _connect(path: Path) -> sqlite3.Connection:
             words = f"Another process is writing {str(path)!r}: wait for it to end, or choose another file."
             raise JournalInUse(words) from error
         raise OSError(errno.EIO, str(error)) from error
-    except sqlite3.DatabaseError as error:
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:  # the second of a message that quotes the damage
         connection.close()
-        if "malformed" in str(error):
+        if "malformed" in str(error) or isinstance(error, UnicodeDecodeError):
             raise _Damaged(path) from error
         raise JournalError(f"{str(path)!r} is of another kind or version: remove it to start again.") from error
     return connection
@@ -324,6 +324,10 @@ def _verify(path: Path, connection: sqlite3.Connection) -> dict[str, Any]:
         head = json.loads(notes[0])
     if not isinstance(head, dict):
         raise JournalError(f"{str(path)!r} is no journal: its head is no object.")
+    # what no record shows: a damaged index finds none of them, and in damaged pages nothing can be written
+    if connection.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",):
+        ((number,),) = connection.execute("SELECT count(*) FROM chunks NOT INDEXED")
+        raise _Damaged(path, number, ": its records match their checksums, but what finds them does not fit them")
     return head
 
 

@@ -141,6 +141,26 @@ def test_a_damaged_record_is_refused_and_those_before_it_can_be_kept(statement: 
     assert samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path) == whole
 
 
+@pytest.mark.parametrize("place", ["freelist", "index", "schema"])
+def test_one_byte_beside_the_records_loses_none_of_them(place: str, tmp_path: Path) -> None:
+    path, method = tmp_path / "j", samplers.MonteCarlo(batch=500)
+    problem = samplers.FunctionProblem(half_space, 4)
+    whole = samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        points = connection.execute("SELECT points FROM chunks WHERE id = 3").fetchone()[0].encode()
+    content = bytearray(path.read_bytes())
+    places = {"freelist": 36, "index": content.rfind(points), "schema": content.find(b"CREATE TABLE")}
+    content[places[place]] ^= 0x80
+    path.write_bytes(content)
+    with pytest.raises(JournalError, match="is damaged"):
+        samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path)
+    if place == "schema":  # that nothing can be read by
+        return
+    with contextlib.closing(Journal.open(path, mend=True)) as journal:
+        assert journal.n == 3000
+    assert samplers.estimate(problem, method, seed=1, max_sim=3000, journal=path) == whole
+
+
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_page_that_is_lost_costs_what_stands_behind_it(cut: bool, tmp_path: Path) -> None:
     path = tmp_path / "j"
