@@ -270,8 +270,9 @@ def _connect(path: Path) -> sqlite3.Connection:
     """Return a connection to a file that nobody else has; raise a JournalError for one in use and for no journal."""
     uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
     connection = sqlite3.connect(uri, uri=True, timeout=0.0, isolation_level=None)
+    begun = () if path.stat().st_size else ("journal_mode = MEMORY",)  # no file that a kill would leave beside it
     try:
-        for statement in ("locking_mode = EXCLUSIVE", "trusted_schema = OFF", "journal_mode = WAL"):
+        for statement in ("locking_mode = EXCLUSIVE", "trusted_schema = OFF", *begun, "journal_mode = WAL"):
             connection.execute(f"PRAGMA {statement}")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute("BEGIN IMMEDIATE")  # takes the lock, which stays

@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import sqlite3
+import subprocess
 import sys
 import time
 import warnings
@@ -19,7 +20,7 @@ import pytest
 
 import samplers
 from samplers import journal as journals
-from samplers.journal import Journal, JournalError, NothingRecorded
+from samplers.journal import Journal, JournalError
 from samplers.problem import FloatArray, TermGradients, Terms
 
 F = Callable[[FloatArray], FloatArray]
@@ -199,18 +200,6 @@ def test_killed_while_sqlite_copies_its_log_into_the_file_nothing_is_lost(
         assert journal.n == 4000
 
 
-@pytest.mark.parametrize("mend", [False, True])
-def test_a_journal_whose_head_is_damaged_is_left_as_it_is(mend: bool, tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    run(path, method="mc")
-    damage(path, "UPDATE chunks SET notes = '{}' WHERE id = 0")
-    content = path.read_bytes()
-    with pytest.raises(JournalError, match="damaged from its first record on") as caught:
-        Journal.open(path, mend)
-    assert not isinstance(caught.value, NothingRecorded)
-    assert path.read_bytes() == content
-
-
 def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
     (tmp_path / "text").write_bytes(b"x" * 5000)
     sqlite3.connect(tmp_path / "other").execute("CREATE TABLE chunks (id)").connection.close()
@@ -274,6 +263,30 @@ def test_creating_replaces_an_empty_journal_alone_and_one_process_has_it(tmp_pat
     assert (replaced.n, replaced.head) == (0, {"seed": 3})
     replaced.remove()
     assert not list(tmp_path.iterdir())
+
+
+BEGIN_AND_KILL = """
+import os, signal, sys, time
+from pathlib import Path
+from samplers.journal import Journal
+
+path, begun = Path(sys.argv[1]), time.perf_counter()
+Journal.create(path, {}).remove()
+seconds = time.perf_counter() - begun
+for kill in range(20):
+    if not (child := os.fork()):
+        Journal.create(path, {})
+        signal.pause()
+    time.sleep(seconds * kill / 20)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    Journal.create(path, {}).remove()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills")
+def test_killed_at_any_time_of_its_beginning_it_can_begin_again(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-c", BEGIN_AND_KILL, tmp_path / "j"], check=True)
 
 
 def test_a_full_disk_ends_nothing_and_what_waits_is_written_later(

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -169,10 +169,7 @@ def test_nobody_else_takes_the_journal(asked: Question) -> None:
         evaluate.resume(RUN, trust=True)
     journal.write_bytes(content)
     with closing(continue_journal(RUN)[0]):  # by another process
-        for attempt in (
-            lambda: evaluate.resume(RUN),
-            lambda: evaluate.run_into(RUN, prepare(asked), force=True),
-        ):
+        for attempt in (lambda: evaluate.resume(RUN), lambda: evaluate.run_into(RUN, prepare(asked), force=True)):
             with pytest.raises(BadInput, match="Another process is writing"):
                 attempt()
     assert evaluate.resume(RUN, trust=True).estimate.n_sim == 1200
@@ -410,15 +407,10 @@ def assert_same_files(run: Path, whole: Path) -> None:
 
 
 def has_simulations(folder: Path) -> bool:
-    """Return whether an unfinished run has something to continue."""
-    if not (folder / JOURNAL).exists():
-        return False
-    try:
-        journal, _ = continue_journal(folder)
-    except BadInput:  # killed before its head was written
-        return False
-    with closing(journal):
+    """Return whether an unfinished run has something to continue: one killed before its head was written is none."""
+    with suppress(BadInput), closing(continue_journal(folder)[0]) as journal:
         return journal.has_simulations
+    return False
 
 
 def kill_and_resume(
