@@ -48,36 +48,46 @@ class Hyperparameters:
     """Standard deviation of the exploration noise of a policy that has none of its own."""
     reward_scale: float = 1.0
     """Factor of the rewards that it learns from."""
-    num_envs: int = 256
-    """Episodes that run side by side."""
 
 
 # A simulation step of hundreds of environments costs about as much as one of a few, so rollouts are
 # short and wide, batches large and networks small. Returns look about 5 s ahead (gamma = 0.98 at
 # 0.1 s). Exploration starts small: random steering leaves the road before braking is learnt.
-# benchmarks/training/speed.py has what epochs, gradient steps and scaled rewards cost and buy.
-_ON_POLICY = {"gamma": 0.98, "gae_lambda": 0.95}
-# Off-policy: one step of the whole batch, then so many updates.
-_OFF_POLICY = {"gamma": 0.98, "batch_size": 1024, "train_freq": 1, "gradient_steps": 8, "learning_rate": 1e-3}
+# benchmarks/training/speed.py has what epochs, gradient steps and returns of several steps cost and buy.
 # The actor runs in every estimate, the critic not.
 _ACTOR_CRITIC = {"net_arch": {"pi": [32, 32], "vf": [64, 64]}, "log_std_init": -1.5}
-_NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
-_PPO = {**_ON_POLICY, "n_steps": 16, "batch_size": 2048, "n_epochs": 5, "clip_range": 0.4, "learning_rate": 2e-3}
-_PPO_POLICY = {**_ACTOR_CRITIC, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
-_A2C = {**_ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
+_PPO = {
+    "gamma": 0.98,
+    "gae_lambda": 0.98,
+    "n_steps": 32,
+    "batch_size": 2048,
+    "n_epochs": 3,
+    "clip_range": 0.4,
+    "learning_rate": 3e-3,
+}
+_PPO_POLICY = {**_ACTOR_CRITIC, "log_std_init": -1.0, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
+_A2C = {"gamma": 0.98, "gae_lambda": 0.95, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
+# Off-policy: one step of the whole batch, then so many updates. What happens reaches the values of the steps
+# before it in fewer updates where returns are of several steps.
+_OFF_POLICY = {"gamma": 0.98, "train_freq": 1, "learning_rate": 1e-3}
+_SAC = {**_OFF_POLICY, "n_steps": 3, "batch_size": 256, "gradient_steps": 6, "tau": 0.0133}
+_TD3 = {**_OFF_POLICY, "batch_size": 1024, "gradient_steps": 8}
 _DQN = {
     **_OFF_POLICY,
-    "gradient_steps": 4,
+    "n_steps": 2,
+    "batch_size": 512,
+    "gradient_steps": 3,
     "exploration_fraction": 0.3,
     "exploration_final_eps": 0.02,
     "target_update_interval": 4096,
 }
+_NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02, num_envs=512),
+        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
-        "sac": Hyperparameters(_OFF_POLICY, _NETS),
-        "td3": Hyperparameters(_OFF_POLICY, _NETS, noise=0.2),
+        "sac": Hyperparameters(_SAC, _NETS),
+        "td3": Hyperparameters(_TD3, _NETS, noise=0.2),
         "dqn": Hyperparameters(_DQN, _NETS, discrete=True),
     }
 )
@@ -146,7 +156,7 @@ def train_ego(
     algo: str = "ppo",
     steps: int = 200_000,
     seed: int = 0,
-    num_envs: int | None = None,
+    num_envs: int = 256,
     out: str | Path = Path("ego.zip"),
     progress: bool = True,
     resume: bool = False,
@@ -165,7 +175,7 @@ def train_ego(
         algo: One of `HYPERPARAMETERS`: "ppo", "a2c", "sac", "td3", "dqn".
         steps: Environment steps, summed over the batch; rounded up to whole rollouts.
         seed: Seed of the networks, the exploration and the scenarios.
-        num_envs: Episodes that run side by side; by default 512 with PPO and 256 with the others.
+        num_envs: Episodes that run side by side.
         out: The `.zip` to write; missing folders are made, a missing suffix is added.
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
@@ -210,7 +220,6 @@ def train_ego(
         which = "one environment to train on in" if retraining else "different environments, one or more"
         raise ValueError(f"Expected {which}, got {', '.join(ids) or 'none'}.")
     hyperparameters = HYPERPARAMETERS[algo]
-    num_envs = hyperparameters.num_envs if num_envs is None else num_envs
     target, device = _prepare_target(Path(out)), make_kwargs.get("device", "cpu")
     arguments = {"env_id": ",".join(ids), "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
     arguments |= {"even_strata": even_strata}
@@ -282,6 +291,8 @@ def _make_model(
     device = device if name != "MlpPolicy" else "cpu"  # on which small networks learn sooner, as SB3 says too
     if isinstance(env.action_space, Discrete) and not (HYPERPARAMETERS[algo].discrete or algo in ("ppo", "a2c")):
         raise ValueError(f"Expected continuous actions (--action) with {algo}; ppo, a2c and dqn take discrete ones.")
+    if isinstance(space, Dict) and "train_freq" in settings:  # for which SB3 has returns of one step only
+        settings = {name: value for name, value in settings.items() if name != "n_steps"}
     algorithm = getattr(stable_baselines3, algo.upper())  # its classes are named so
     policy = {"activation_fn": nn.ReLU, **policy}
     return algorithm(name, env, policy_kwargs=policy, seed=seed, device=device, **settings)

@@ -69,6 +69,13 @@ def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> N
     assert ((f == -1.0) | (f > 0.0)).all()
 
 
+@pytest.mark.parametrize("algo", ["dqn", pytest.param("sac", marks=pytest.mark.slow)])
+def test_several_observations_are_learnt_from_without_returns_of_several_steps(algo: str, tmp_path: Path) -> None:
+    """Stable-Baselines3 has such returns for an array, not for a dictionary of them."""
+    path = train_ego(ENV, algo, 32, 0, 4, out=tmp_path / "ego", progress=False, observation="features+lidar")
+    assert set(load_ego(path).observation_space) == {"features", "lidar"}  # type: ignore[attr-defined]
+
+
 @pytest.mark.slow
 @use_one_thread()
 def test_a_trained_ego_collides_far_less_than_a_random_policy(tmp_path: Path) -> None:
