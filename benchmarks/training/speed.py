@@ -2,9 +2,9 @@
 
     python -m benchmarks.training.speed
 
-Speeds are of short trainings in turn, by the processor's time. For the egos both train for 200,000 steps with each of 8
-seeds, drive the same 2,048 fresh episodes of each scenario, and p is estimated in the cut-in. Differences are of pairs
-with one training seed, and their intervals Student's. Writes benchmarks/results/training_speed.json.
+Both train for 200,000 steps with each of 8 seeds, in turn; the egos drive the same 2,048 fresh episodes of each
+scenario, and p is estimated in the cut-in. Speeds are by the time of the processor. Differences are of pairs with one
+training seed, and their intervals Student's. Writes benchmarks/results/training_speed.json.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ from training.ego_training import HYPERPARAMETERS, Hyperparameters
 
 RESULT = RESULTS / "training_speed.json"
 STEPS, EPISODES, FIRST_SEED = 200_000, 2_048, 100
-PAIRS, SHORT = 5, 40_000
-"""Trainings whose speeds are compared, in turn, and their steps."""
 CUT_IN, ALL = ("rare_envs/CutIn-v0",), ("rare_envs/CutIn-v1", "rare_envs/HardBrake-v0")
 CASES = {"ppo": ("ppo", CUT_IN), "ppo all": ("ppo", ALL), "sac": ("sac", CUT_IN), "dqn": ("dqn", CUT_IN)}
 """Algorithms and where they train; "all" is what `train-ego all` trains in."""
@@ -87,12 +85,12 @@ def mean_return(ego: Any, env_id: str) -> float:
     return float(total.mean())
 
 
-def train(case: str, settings: str, seed: int, folder: Path, steps: int = STEPS) -> tuple[Path, float, float]:
+def train(case: str, settings: str, seed: int, folder: Path) -> tuple[Path, float, float]:
     """Train an ego in a new folder; return its file, and seconds of the processor and of the clock."""
     algo, ids = CASES[case]
     with mock.patch.object(ego_training, "HYPERPARAMETERS", SETTINGS[settings]):
         cpu, wall = time.process_time(), time.perf_counter()
-        path = train_ego(ids, algo, steps, seed, out=folder / "ego.zip", progress=False)
+        path = train_ego(ids, algo, STEPS, seed, out=folder / "ego.zip", progress=False)
         return path, time.process_time() - cpu, time.perf_counter() - wall
 
 
@@ -104,16 +102,6 @@ def train_and_judge(case: str, settings: str, seed: int) -> Trained:
     found = samplers.estimate(rare_envs.DrivingProblem(CUT_IN[0], ego=ego), samplers.TwoStage(), seed=0)
     returns = tuple(mean_return(ego, each) for each in CASES[case][1])
     return Trained(case, settings, seed, cpu, wall, returns, found.p, found.cov)
-
-
-def measure_speed(case: str) -> dict[str, list[float]]:
-    """Return the processor seconds of short trainings with each of the settings, in turn."""
-    found: dict[str, list[float]] = {which: [] for which in SETTINGS}
-    for seed in range(PAIRS):
-        for which in SETTINGS if seed % 2 else reversed(SETTINGS):
-            with tempfile.TemporaryDirectory() as folder:
-                found[which].append(train(case, which, seed, Path(folder), SHORT)[1])
-    return found
 
 
 def differ(pairs: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
@@ -135,11 +123,10 @@ def compare(record: Mapping[str, Any], case: str) -> dict[str, Any]:
     seeds = sorted(seed for which, seed in rows if which == "new" and ("old", seed) in rows)
     pairs = [(rows["old", seed], rows["new", seed]) for seed in seeds]
     found: dict[str, Any] = {"seeds": len(pairs)}
-    if case in record["speed"]:
-        spent = record["speed"][case]
-        found |= {f"steps per cpu second, {which}": SHORT / float(np.median(spent[which])) for which in SETTINGS}
-        found["times as fast"] = geometric(list(zip(spent["new"], spent["old"], strict=True)))
     if len(pairs) > 1:
+        spent = [tuple(one["cpu_seconds"] for one in pair) for pair in pairs]
+        found |= {f"steps per cpu second, {w}": STEPS / float(np.mean(spent, 0)[i]) for i, w in enumerate(SETTINGS)}
+        found["times as fast"] = geometric([(new, old) for old, new in spent])
         returns = [tuple(float(np.mean(one["returns"])) for one in pair) for pair in pairs]
         found |= {f"return, {which}": float(np.mean([pair[i] for pair in returns])) for i, which in enumerate(SETTINGS)}
         found["return, new minus old"] = differ(returns)
@@ -152,7 +139,7 @@ def compare(record: Mapping[str, Any], case: str) -> dict[str, Any]:
 def read(out: Path) -> dict[str, Any]:
     """Return what has been measured so far."""
     known = json.loads(out.read_text()) if out.exists() else {}
-    return {name: known.get(name, empty) for name, empty in (("speed", {}), ("trained", []))}
+    return {"trained": known.get("trained", [])}
 
 
 def write(out: Path, measured: Mapping[str, Any]) -> None:
@@ -161,7 +148,7 @@ def write(out: Path, measured: Mapping[str, Any]) -> None:
         "command": "python -m benchmarks.training.speed",
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, one thread; load {os.getloadavg()[0]:.0f}",
         "versions": {"rare_envs": rare_envs.__version__, "torch": torch.__version__},
-        "settings": {"steps": STEPS, "episodes": EPISODES, "estimate": "TwoStage(), seed 0", "steps of a pair": SHORT},
+        "settings": {"steps": STEPS, "episodes": EPISODES, "estimate": "TwoStage(), seed 0"},
         "comparisons": {case: compare(measured, case) for case in CASES},
     }
     replace_text(out, json.dumps(about | dict(measured), indent=1) + "\n")
@@ -179,9 +166,6 @@ def main(
         train_ego(CASES["ppo all"][1], "ppo", 64, out=Path(folder) / "ego.zip", num_envs=2, progress=False)
     for name in case or CASES:
         measured = read(out)
-        if name not in measured["speed"] and not settings:
-            measured["speed"][name] = measure_speed(name)
-            write(out, measured)
         done = {(one["settings"], one["seed"]) for one in measured["trained"] if one["case"] == name}
         for seed in range(FIRST_SEED, FIRST_SEED + seeds):
             for which in settings or SETTINGS:

@@ -123,10 +123,7 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, algo: str, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("algo", "steps", "trained"),
-    [
-        ("ppo", 480, 1),
-        *(pytest.param(algo, 160, 5, marks=pytest.mark.slow) for algo in ("sac", "td3", "dqn")),
-    ],
+    [("ppo", 480, 1), *(pytest.param(each, 160, 5, marks=pytest.mark.slow) for each in ("sac", "td3", "dqn"))],
 )
 def test_a_resumed_training_ends_alike(
     algo: str, steps: int, trained: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
