@@ -48,6 +48,8 @@ class Hyperparameters:
     """Standard deviation of the exploration noise of a policy that has none of its own."""
     reward_scale: float = 1.0
     """Factor of the rewards that it learns from."""
+    num_envs: int = 256
+    """Episodes that run side by side."""
 
 
 # A simulation step of hundreds of environments costs about as much as one of a few, so rollouts are
@@ -56,35 +58,21 @@ class Hyperparameters:
 # benchmarks/training/speed.py has what epochs, gradient steps and returns of several steps cost and buy.
 # The actor runs in every estimate, the critic not.
 _ACTOR_CRITIC = {"net_arch": {"pi": [32, 32], "vf": [64, 64]}, "log_std_init": -1.5}
-_PPO = {
-    "gamma": 0.98,
-    "gae_lambda": 0.98,
-    "n_steps": 32,
-    "batch_size": 2048,
-    "n_epochs": 3,
-    "clip_range": 0.4,
-    "learning_rate": 3e-3,
-}
+_ON_POLICY = {"gamma": 0.98, "gae_lambda": 0.98}
+_PPO = {**_ON_POLICY, "n_steps": 32, "batch_size": 2048, "n_epochs": 3, "clip_range": 0.4, "learning_rate": 3e-3}
 _PPO_POLICY = {**_ACTOR_CRITIC, "log_std_init": -1.0, "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
-_A2C = {"gamma": 0.98, "gae_lambda": 0.95, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
+_A2C = {**_ON_POLICY, "gae_lambda": 0.95, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True}
 # Off-policy: one step of the whole batch, then so many updates. What happens reaches the values of the steps
 # before it in fewer updates where returns are of several steps.
 _OFF_POLICY = {"gamma": 0.98, "train_freq": 1, "learning_rate": 1e-3}
 _SAC = {**_OFF_POLICY, "n_steps": 3, "batch_size": 256, "gradient_steps": 6, "tau": 0.0133}
 _TD3 = {**_OFF_POLICY, "batch_size": 1024, "gradient_steps": 8}
-_DQN = {
-    **_OFF_POLICY,
-    "n_steps": 2,
-    "batch_size": 512,
-    "gradient_steps": 3,
-    "exploration_fraction": 0.3,
-    "exploration_final_eps": 0.02,
-    "target_update_interval": 4096,
-}
+_DQN = {**_OFF_POLICY, "n_steps": 2, "batch_size": 512, "gradient_steps": 3, "target_update_interval": 4096}
+_DQN |= {"exploration_fraction": 0.3, "exploration_final_eps": 0.02}
 _NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02),
+        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02, num_envs=320),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
         "sac": Hyperparameters(_SAC, _NETS),
         "td3": Hyperparameters(_TD3, _NETS, noise=0.2),
@@ -156,7 +144,7 @@ def train_ego(
     algo: str = "ppo",
     steps: int = 200_000,
     seed: int = 0,
-    num_envs: int = 256,
+    num_envs: int | None = None,
     out: str | Path = Path("ego.zip"),
     progress: bool = True,
     resume: bool = False,
@@ -175,7 +163,7 @@ def train_ego(
         algo: One of `HYPERPARAMETERS`: "ppo", "a2c", "sac", "td3", "dqn".
         steps: Environment steps, summed over the batch; rounded up to whole rollouts.
         seed: Seed of the networks, the exploration and the scenarios.
-        num_envs: Episodes that run side by side.
+        num_envs: Episodes that run side by side; by default 320 with PPO and 256 with the others.
         out: The `.zip` to write; missing folders are made, a missing suffix is added.
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
@@ -220,6 +208,7 @@ def train_ego(
         which = "one environment to train on in" if retraining else "different environments, one or more"
         raise ValueError(f"Expected {which}, got {', '.join(ids) or 'none'}.")
     hyperparameters = HYPERPARAMETERS[algo]
+    num_envs = hyperparameters.num_envs if num_envs is None else num_envs
     target, device = _prepare_target(Path(out)), make_kwargs.get("device", "cpu")
     arguments = {"env_id": ",".join(ids), "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
     arguments |= {"even_strata": even_strata}

@@ -37,13 +37,13 @@ def test_settings_are_those_of_our_own_training(algo: str) -> None:
     entries, ours, per_step = read(algo), HYPERPARAMETERS[algo], {"ppo": "n_steps", "dqn": "train_freq"}[algo]
     assert set(entries) == set(rare_envs.ENV_IDS)
     for entry in entries.values():
-        assert entry[per_step] * entry["n_envs"] == ours.settings[per_step] * 256  # the Zoo's are fewer
+        assert entry[per_step] * entry["n_envs"] == ours.settings[per_step] * ours.num_envs  # the Zoo's are fewer
         same = {name: value for name, value in ours.settings.items() if name != per_step}
         assert {name: entry[name] for name in same} == same
         assert policy_of(entry) == {**ours.policy, "activation_fn": nn.ReLU}
         assert ("normalize" in entry) == (ours.reward_scale != 1.0)
         if algo == "dqn":  # `train_ego` keeps every transition, and waits for ten of each environment
-            assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * 256
+            assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * ours.num_envs
 
 
 def test_the_algorithms_take_them() -> None:
