@@ -1,4 +1,6 @@
-"""Claims about a run or a risk: a tree in goal structuring notation, judged by the files that its leaves name.
+"""Claims about a run or a risk: a tree in goal structuring notation (GSN), judged by the files that its leaves name.
+
+Each leaf names a file, a JSON pointer into it and a rule; anybody can apply the rule to the file again (`judge_leaf`).
 
 References:
     GSN Community Standard, version 3, 2021; RFC 6901, JSON Pointer.
@@ -11,7 +13,7 @@ import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -32,25 +34,15 @@ DISCLAIMER = (
 )
 ENOUGH_COV = 0.3
 """Largest relative standard error of p at which the simulations are called enough."""
-Status = Literal["supported", "not supported", "not known"]
 KNOWN = "known"
 """What a leaf wants of a value if it wants one at all."""
 
 
-def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> Status:
-    """Return the status of a leaf of claims.json, from its file in the folder of the run.
+def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> str:
+    """Return "supported", "not supported" or "not known" of a leaf of claims.json, from its file in the folder.
 
-    A file whose digest is not that in manifest.json supports nothing; for test cases their own files count too.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: It is no JSON object.
-
-    Example:
-        >>> judge_leaf(Path("runs/nowhere"), {"file": "result.json", "pointer": "/p", "rule": "known"})
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: [Errno 2] No such file or directory: 'runs/nowhere/result.json'
+    A file whose digest is not that in manifest.json supports nothing; for test cases their own files count too. One
+    that cannot be read is an OSError, one without a JSON object a ValueError.
     """
     file, value = leaf["file"], read_pointer(read_object(folder / leaf["file"]), leaf["pointer"])
     if value in (None, ""):
@@ -203,30 +195,20 @@ def _list_nodes(top: str, goals: Goals) -> list[dict[str, Any]]:
 
 
 def _describe_limit(result: Mapping[str, Any]) -> str:
-    """Return what the top claim says: the upper limit of a run, and what a gate decided of it."""
-    question, rate = result["question"], result.get("rate")
-    ego, env_id = question["ego"], question["env_id"]
-    level = f"{100 * result['confidence']:g} %"
-    high = _find_upper_limit(result)
+    """Return what the top claim says: the widest upper limit of a run, and what a gate decided of it."""
+    question, rate, traffic = result["question"], result.get("rate"), result.get("base_uncertainty") or {}
+    ends = (result["interval"][1], (traffic.get("interval") or [None, None])[1], traffic.get("bound"))
+    high = max(float(end) for end in ends if end is not None)
     limit = f"Upper limit {format_probability(high)} per scenario"
     if rate is not None:
         limit = f"Upper limit {format_rate(rate['interval_per_million_km'][1])} per million km"
-    if high >= 1:
-        limit = "No upper limit"
-    return f"{limit}; {_describe_gate(result.get('gate'))} ({ego} in {env_id}, {level})"
+    about = f"{question['ego']} in {question['env_id']}, {100 * result['confidence']:g} %"
+    return f"{limit if high < 1 else 'No upper limit'}; {_describe_gate(result.get('gate'))} ({about})"
 
 
 def _describe_gate(gate: Mapping[str, Any] | None) -> str:
     """Return what was decided of a limit."""
-    known = f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}" if gate else ""
-    return known or "no acceptance limit was set"
-
-
-def _find_upper_limit(result: Mapping[str, Any]) -> float:
-    """Return the widest upper limit of p that the run states, of sampling and of recorded events."""
-    traffic = result.get("base_uncertainty") or {}
-    ends = [result["interval"][1], (traffic.get("interval") or [0.0, 0.0])[1], traffic.get("bound")]
-    return max(float(end) for end in ends if end is not None)
+    return f"limit {gate['limit']:g} {gate['quantity']}: {gate['decision']}" if gate else "no acceptance limit was set"
 
 
 def judge_claims(folder: Path, nodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

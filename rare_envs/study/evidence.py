@@ -1,12 +1,10 @@
 """Evidence: what a safety engineer files about a run, made from its folder alone.
 
 It has what was covered, how uncertain the number is and from what, checks of the tool chain, test cases, and a claim
-tree in goal structuring notation (GSN). Each leaf of the tree names a file, a JSON pointer into it and a rule; anybody
-can apply the rule to the file again (`judge_leaf`). Nothing here assesses conformity with a regulation or a standard.
+tree, `claims`. Nothing here assesses conformity with a regulation or a standard.
 
 References:
-    ISO 34502:2022, traffic disturbance scenarios; ISO 34505:2025, test cases; GSN Community Standard, version 3, 2021;
-    RFC 6901, JSON Pointer.
+    ISO 34502:2022, traffic disturbance scenarios; ISO 34505:2025, test cases.
 """
 
 from __future__ import annotations
@@ -16,54 +14,23 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib import resources
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from scipy.stats import poisson
 
 from rare_envs.files import format_json, replace_text
-from rare_envs.plugins import clean_text
 from rare_envs.scenarios.registry import env_id_of, find_scenario
 from rare_envs.simulation.terms import EpisodeTerms
 from rare_envs.startup import __version__
+from rare_envs.study import claims, episodes
 from rare_envs.study.arguments import BadInput, as_bad_input, output_folder
-from rare_envs.study.claims import (
-    CLAIMS,
-    COVERAGE,
-    DISCLAIMER,
-    ENOUGH_COV,
-    FILES,
-    MANIFEST,
-    ORIGIN,
-    TEST_CASES,
-    TRAFFIC,
-    UNCERTAINTY,
-    VALIDATION,
-    Digests,
-    build_claims,
-    build_claims_of_sum,
-    digest_file,
-    digest_files,
-    draw_claims,
-    find_changed,
-    judge_claims,
-    judge_leaf,
-    list_runs,
-    read_object,
-)
-from rare_envs.study.episodes import (
-    digest_scenarios,
-    draw_ordinary,
-    find_ordinary_range,
-    list_columns,
-    name_columns,
-    read_scenarios,
-)
 from rare_envs.study.evaluate import run
 from rare_envs.study.export import export_drive
+from rare_envs.study.html_report import render
 from rare_envs.study.question import Study, open_run, prepare
 from rare_envs.study.replay import REPLAY_TOLERANCE, Drive, drive_again, read_row
 from rare_envs.study.report import Repeatability, Report
@@ -75,18 +42,18 @@ from samplers.evaluate import find_changed as find_differing
 from samplers.output import to_json_value
 from samplers.problem import EvaluationError, FloatArray
 
-__all__ = ["EVIDENCE", "SCHEMA", "judge_leaf", "write_evidence"]
-
+Files = dict[str, dict[str, Any]]
+Known = claims.Digests
 PICTURE, PAGE, SCHEMA_FILE = "claims.svg", "evidence.html", "evidence.schema.json"
 _SCHEMA = resources.files("rare_envs") / "data" / "evidence_schema.json"
 SCHEMA: dict[str, Any] = json.loads(_SCHEMA.read_text("utf-8"))
 """JSON schema of all files of the evidence together, {name: content}; of a run, or of a risk."""
-N_COMPARED = 1_000
-"""Ordinary scenarios that both simulators drive."""
-MOST_CASES = 20
-"""Test cases at most."""
+N_COMPARED, MOST_CASES = 1_000, 20
+"""Ordinary scenarios that both simulators drive, and test cases at most."""
 EQUAL = 1e-9
 """Largest relative difference of a number that is computed again."""
+MADE_BY = ("command", "begun", "finished", "seed", "ego", "base", "versions", "files")
+"""What made a run and makes it again."""
 NOT_COMPUTED = ("seconds", "earlier_seconds", "n_retried", "faults", "question", "version")
 """What a result has beside what follows from its simulations."""
 FACTOR = "Its contacts are {:.2g} times the nearest end of people's interval (1: inside); nothing was multiplied by it."
@@ -96,21 +63,12 @@ SUM_AGAIN = f"{RISK} computed again from its runs; the spread between sites is t
 """What is computed again."""
 CHECK_TAIL = 0.025
 """A recorded count is outside what the traffic model expects if a count as extreme has a smaller probability."""
-
 MOTIONS = ("cut-in", "cut-out", "acceleration", "deceleration")
-CELLS = tuple(
-    f"{road}, {ego}, {motion}"
-    for road in ("main roadway", "merging zone", "departure zone")
-    for ego in ("lane keep", "lane change")
-    for motion in MOTIONS
-)
+SECTORS, EGOS = ("main roadway", "merging zone", "departure zone"), ("lane keep", "lane change")
+CELLS = tuple(map(", ".join, product(SECTORS, EGOS, MOTIONS)))
 """The 24 traffic disturbance scenarios of ISO 34502: road sector, behaviour of the ego, motion of another vehicle."""
-_COVERED: dict[str, tuple[str, ...]] = {
-    "cut_in": ("cut-in",),
-    "hard_brake": ("deceleration",),
-    "car_following": (),  # the lead keeps its speed, which is no disturbance of the list
-    "highway": MOTIONS,
-}
+# in car-following the lead keeps its speed, which is no disturbance of the list
+_COVERED = {"cut_in": MOTIONS[:1], "hard_brake": MOTIONS[3:], "highway": MOTIONS}
 NOT_COVERED = (
     "perception disturbances (blind spots, sensor limits, weather), unless the ego's own sensors have them",
     "vehicle control disturbances (road surface, wind, vehicle faults)",
@@ -126,8 +84,7 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
         trust: Whether code that a folder from elsewhere names may run.
 
     Returns:
-        The files written, the page of each run before its others, those of a sum last. Those of an earlier call are
-        replaced.
+        The files written, in place of earlier ones, the page of each run before its others, those of a sum last.
 
     Raises:
         BadInput: There is no finished run, it may not be driven again, or a file cannot be written.
@@ -137,92 +94,84 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
             f"Expected the folder of rare-envs estimate or risk, got that of a comparison, {str(folder)!r}, whose runs "
             "keep no simulations: evidence is of one ego, from its own rare-envs risk EGO --out FOLDER."
         )
-    known: Digests = {}
+    known: Known = {}
     if not (folder / RISK).is_file():
         return _write_evidence_of_run(folder, trust, known)[1]
     with as_bad_input(OSError, ValueError):
-        runs, recorded = list_runs(folder), read_object(folder / RISK)
-        filed = find_changed(folder, known=known) if (folder / EVIDENCE / MANIFEST).is_file() else []
+        runs, recorded = claims.list_runs(folder), claims.read_object(folder / RISK)
+        filed = claims.find_changed(folder, known=known) if (folder / EVIDENCE / claims.MANIFEST).is_file() else []
     found = {part.name: _write_evidence_of_run(part, trust, known) for part in runs}
     reports, out = {name: report for name, (report, _) in found.items()}, folder / EVIDENCE
-    with output_folder(out, PAGE, *FILES), as_bad_input(OSError, ValueError, KeyError, TypeError):
+    with output_folder(out, PAGE, *claims.FILES), as_bad_input(OSError, ValueError, KeyError, TypeError):
         remove_evidence(folder)
         content = describe_sum(folder, recorded, reports, filed)
         title = f"{recorded['ego']} in {' and '.join(map(name_scenario, reports))}"
-        _finish(folder, title, content, build_claims_of_sum(recorded), recorded["text"], known)
-    names = (PAGE, *content, MANIFEST, PICTURE, SCHEMA_FILE)  # claims among its content by now
-    return (*(path for _, files in found.values() for path in files), *(out / name for name in names))
+        own = _finish(folder, title, content, claims.build_claims_of_sum(recorded), recorded["text"], known)
+    return (*chain(*(files for _, files in found.values())), *own)
 
 
-def _write_evidence_of_run(folder: Path, trust: bool, known: Digests) -> tuple[Report | str, tuple[Path, ...]]:
+def _write_evidence_of_run(folder: Path, trust: bool, known: Known) -> tuple[Report | str, tuple[Path, ...]]:
     """Write the evidence of one run; return its report, or why that cannot be computed again, and the files."""
     study = load_finished(folder)
     prepared = prepare(open_run(study, trust))
     out = folder / EVIDENCE
-    with output_folder(out, PAGE, *FILES, folders=("test_cases",)), as_bad_input(OSError, ValueError):
-        filed = find_changed(folder, known=known) if (out / MANIFEST).is_file() else []
+    with output_folder(out, PAGE, *claims.FILES, folders=("test_cases",)), as_bad_input(OSError, ValueError):
+        filed = claims.find_changed(folder, known=known) if (out / claims.MANIFEST).is_file() else []
         remove_evidence(folder)
         rows, report = list_failures(study), compute_again(study, prepared)
-        x = [read_row(study.failures, prepared.problem, row) for row in rows]
-        drives = [drive_again(prepared.problem, each) for each in x]
-        content: dict[str, dict[str, Any]] = {
-            COVERAGE: describe_coverage(prepared),
-            UNCERTAINTY: list_uncertainty(study.result),
-            VALIDATION: validate(study, prepared, drives, report, filed),
-            TRAFFIC: describe_traffic_model(prepared),
-            TEST_CASES: write_test_cases(out, study, prepared, rows, drives),
-            ORIGIN: describe_origin(study.about),
+        drives = [drive_again(prepared.problem, read_row(study.failures, prepared.problem, row)) for row in rows]
+        content: Files = {
+            claims.COVERAGE: describe_coverage(prepared),
+            claims.UNCERTAINTY: list_uncertainty(study.result),
+            claims.VALIDATION: validate(study, prepared, drives, report, filed),
+            claims.TRAFFIC: describe_traffic_model(prepared),
+            claims.TEST_CASES: write_test_cases(out, study, prepared, rows, drives),
+            claims.ORIGIN: {name: study.about.get(name) for name in MADE_BY},
         }
-        question = study.question
-        title = f"{question['ego']} in {question['env_id']}"
-        _finish(folder, title, content, build_claims(study.result), study.result.get("text") or [], known)
-    cases = [out / name for case in content[TEST_CASES]["cases"] for name in case["files"]]
-    return report, (out / PAGE, *(out / name for name in (*FILES, MANIFEST, PICTURE, SCHEMA_FILE)), *cases)
+        title, answer = f"{study.question['ego']} in {study.question['env_id']}", study.result.get("text") or []
+        return report, _finish(folder, title, content, claims.build_claims(study.result), answer, known)
 
 
 def _finish(
-    folder: Path,
-    title: str,
-    content: dict[str, dict[str, Any]],
-    nodes: Sequence[Mapping[str, Any]],
-    answer: Sequence[str],
-    known: Digests,
-) -> None:
-    """Write the files of the evidence in a folder, its claims, judged by them, and its page."""
+    folder: Path, title: str, content: Files, nodes: Sequence[Mapping[str, Any]], answer: Sequence[str], known: Known
+) -> tuple[Path, ...]:
+    """Write the files of the evidence in a folder, its claims, judged by them, and its page; return all, this first."""
     out = folder / EVIDENCE
     for name, value in content.items():
         replace_text(out / name, format_json(to_json_value(value)))
     _seal(folder, known)
-    content[CLAIMS] = judge_claims(folder, nodes)
-    replace_text(out / CLAIMS, format_json(content[CLAIMS]))
-    replace_text(out / PICTURE, draw_claims(content[CLAIMS]["nodes"]))
+    content[claims.CLAIMS] = claims.judge_claims(folder, nodes)
+    replace_text(out / claims.CLAIMS, format_json(content[claims.CLAIMS]))
+    replace_text(out / PICTURE, claims.draw_claims(content[claims.CLAIMS]["nodes"]))
     replace_text(out / SCHEMA_FILE, format_json(SCHEMA))
-    replace_text(out / PAGE, render(title, answer, content, (out / PICTURE).read_text(encoding="utf-8")))
+    picture = (out / PICTURE).read_text(encoding="utf-8")
+    page: dict[str, Any] = {"title": title, "answer": answer, "disclaimer": claims.DISCLAIMER}
+    page["picture"] = Markup(picture[picture.index("<svg") :])  # of this program, its texts escaped
+    page |= {name.removesuffix(".json"): value for name, value in content.items()}
+    replace_text(out / PAGE, render("evidence.html.j2", page))
     _seal(folder, known)
+    return tuple(sorted(filter(Path.is_file, out.rglob("*")), key=lambda path: (path.name != PAGE, path)))
 
 
-def _seal(folder: Path, known: Digests) -> None:
+def _seal(folder: Path, known: Known) -> None:
     """Write the manifest with the digests of all files as they are now."""
-    replace_text(folder / EVIDENCE / MANIFEST, format_json({"sha256": digest_files(folder, ("",), known)}))
+    digests = {"sha256": claims.digest_files(folder, ("",), known)}
+    replace_text(folder / EVIDENCE / claims.MANIFEST, format_json(digests))
 
 
-def digest_manifest(files: Sequence[Path]) -> tuple[str, str]:
-    """Return the manifest among evidence files that has digests of all, and its own, which is to be kept elsewhere."""
-    path = next(path for path in reversed(files) if path.name == MANIFEST)
-    return str(path), digest_file(path)
-
-
-def list_changes(files: Sequence[Path]) -> list[str]:
-    """Return the files of a run or a risk, or of earlier evidence, that evidence files found to be changed."""
-    return list(read_object(next(path for path in reversed(files) if path.name == VALIDATION))["changed"])
+def sum_up(files: Sequence[Path]) -> tuple[list[str], str, str]:
+    """Return the files found to be changed, the manifest with digests of all, and its own, to be kept elsewhere."""
+    last = {path.name: path for path in files}
+    changed = list(claims.read_object(last[claims.VALIDATION])["changed"])
+    return changed, str(last[claims.MANIFEST]), claims.digest_file(last[claims.MANIFEST])
 
 
 class _Recorded:
     """The problem of a run, whose f are those that it has recorded."""
 
     def __init__(self, problem: Any, study: LoadedStudy) -> None:
-        table = study.episodes([*name_columns(problem.space), "f"])
-        keys, f = digest_scenarios(read_scenarios(table, problem.space)), table["f"].to_numpy()
+        table = study.episodes([*episodes.name_columns(problem.space), "f"])
+        keys, f = episodes.digest_scenarios(episodes.read_scenarios(table, problem.space)), table["f"].to_numpy()
         self._problem, self._f = problem, dict(zip(keys, f.tolist(), strict=True))
         self.n_terms, self.largest = 0, list[float]()
 
@@ -233,7 +182,7 @@ class _Recorded:
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f (n,) of scenarios x (n, d) of the run."""
         try:
-            return np.array([self._f[key] for key in digest_scenarios(x)], dtype=np.float64)
+            return np.array([self._f[key] for key in episodes.digest_scenarios(x)], dtype=np.float64)
         except KeyError:
             raise EvaluationError("the method asks for simulations that the run does not have") from None
 
@@ -250,9 +199,8 @@ class _Recorded:
 def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
     """Return the report that the method gives with the simulations of a run, or why there is none.
 
-    Nothing is simulated but failures, for what they are like, and the terms and gradients of method series, whose f are
-    compared with the recorded ones. Another processor or version of a library may round
-    otherwise, so that a method goes another way, and asks for other simulations.
+    Nothing is simulated but failures, for what they are like, and the terms of method series, whose f are compared.
+    Where numbers are rounded otherwise (processor, library) a method may ask for other simulations.
     """
     if not study.episodes_path.is_file():
         return f"there is no {study.episodes_path.name}"
@@ -263,9 +211,9 @@ def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
         report = run(replace(prepared, problem=problem, ego_was_given=True))
     except BadInput as error:
         return str(error)
-    again = study.result.get("repeatability")
     if problem.largest:
-        again = {"n": problem.n_terms, "n_differing": len(problem.largest), "largest": max(problem.largest)}
+        return replace(report, repeatability=Repeatability(problem.n_terms, len(problem.largest), max(problem.largest)))
+    again = study.result.get("repeatability")
     if again is not None:  # a difference that is infinite has no number
         again = Repeatability(**{**again, "largest": np.inf if again["largest"] is None else again["largest"]})
     return replace(report, repeatability=again)
@@ -288,11 +236,6 @@ def _agree(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _describe_again(what: str, differing: list[str] | None, reason: str) -> dict[str, Any]:
-    """Return what was found by computing a result again."""
-    return {"what": what, "differing": differing, "reason": reason}
-
-
 def list_failures(study: LoadedStudy) -> list[int]:
     """Return the rows of failures.csv for test cases: the most likely of each mode, then the next most likely."""
     of_modes = [mode["failure"] for mode in study.result.get("modes") or [] if mode.get("failure") is not None]
@@ -307,7 +250,7 @@ def describe_coverage(study: Study) -> dict[str, Any]:
     road = scenario.road
     curvature = max((abs(each) for each in road.reference_line.curvature), default=0.0) if road.reference_line else 0.0
     covered = [f"main roadway, lane keep, {motion}" for motion in _COVERED.get(scenario.name, ())]
-    low, high = find_ordinary_range(draw_ordinary(problem.space))
+    low, high = episodes.find_ordinary_range(episodes.draw_ordinary(problem.space))
     return {
         "statement": "Only what is listed as covered was simulated. The number says nothing about anything else.",
         "scenario": question.env_id,
@@ -329,7 +272,7 @@ def describe_coverage(study: Study) -> dict[str, Any]:
         },
         "parameters": [
             {"name": column.name, "unit": column.unit, "central_90_percent": [float(low[j]), float(high[j])]}
-            for j, column in enumerate(list_columns(problem.space))
+            for j, column in enumerate(episodes.list_columns(problem.space))
             if column.shown
         ],
         "counted": f"{question.measure} <= {question.gamma:g}, collisions of {question.collisions}",
@@ -341,20 +284,19 @@ def list_uncertainty(result: Mapping[str, Any]) -> dict[str, Any]:
     traffic, events = result.get("base_uncertainty") or {}, result.get("events") or []
     variance = (result.get("rate") or {}).get("log_variance") or {}
     known = (traffic.get("reason") or "") == "" and traffic.get("interval") is not None
-    sources = [
-        _source("sampling", "finite number of simulations", result["interval"], "/interval"),
-        _source("undiscovered", "a crash type that no simulation met, at most", [0.0, result.get("unseen")], "/unseen"),
-        _source(
-            "traffic model",
-            f"few recorded events: {traffic.get('fitted_to') or 'not fitted to events'}",
-            traffic["interval"] if known else [0.0, traffic.get("bound")],
-            "/base_uncertainty/interval" if known else "/base_uncertainty/bound",
-        ),
+    ends = traffic["interval"] if known else [0.0, traffic.get("bound")]
+    few = f"few recorded events: {traffic.get('fitted_to') or 'not fitted to events'}"
+    rows = (
+        ("sampling", "finite number of simulations", list(result["interval"]), "/interval"),
+        ("undiscovered", "a crash type that no simulation met, at most", [0.0, result.get("unseen")], "/unseen"),
+        ("traffic model", few, list(ends), f"/base_uncertainty/{'interval' if known else 'bound'}"),
+    )
+    sources: list[dict[str, Any]] = [
+        {**dict(zip(("source", "what", "interval_of_p", "pointer"), row, strict=True)), "file": RESULT} for row in rows
     ]
     upper, rate = sources[2]["interval_of_p"][1], result.get("rate") or {"determined": True}
     sources[2]["limited"] = None if upper is None else bool(upper < 1 and rate["determined"])
     total = sum(variance.values())
-    shares = {name: value / total for name, value in variance.items()} if total else {}
     calibration = [
         {
             "event": each["event"],
@@ -375,10 +317,10 @@ def list_uncertainty(result: Mapping[str, Any]) -> dict[str, Any]:
             "relative_error": cov,
             "too_few_failures_in": unresolved,
             "status": result.get("status"),
-            "enough": None if cov is None else bool(cov <= ENOUGH_COV and sure),
+            "enough": None if cov is None else bool(cov <= claims.ENOUGH_COV and sure),
         },
         "sources": sources,
-        "shares_of_log_variance_of_the_rate": shares,
+        "shares_of_log_variance_of_the_rate": {name: each / total for name, each in variance.items() if total},
         "calibration": calibration,
         "rate_per_million_km": (result.get("rate") or {}).get("interval_per_million_km"),
         "left_out": "the choice of the model family, drivers' behaviour outside the recordings, rounding",
@@ -391,17 +333,8 @@ def _list_unresolved(result: Mapping[str, Any]) -> list[str]:
     return [name.replace("unseen", "no look") for name in names]
 
 
-def _source(name: str, what: str, interval: Sequence[float | None], pointer: str) -> dict[str, Any]:
-    """Return a row of the budget."""
-    return {"source": name, "what": what, "interval_of_p": list(interval), "file": RESULT, "pointer": pointer}
-
-
 def validate(
-    study: LoadedStudy,
-    prepared: Study,
-    drives: Sequence[Drive],
-    again: Report | str,
-    filed: Sequence[str] = (),
+    study: LoadedStudy, prepared: Study, drives: Sequence[Drive], again: Report | str, filed: Sequence[str]
 ) -> dict[str, Any]:
     """Return checks of the tool chain: failures driven and the result computed again, simulators, doubts, changes."""
     rows, result = list_failures(study), study.result
@@ -422,7 +355,7 @@ def validate(
             "tolerance": REPLAY_TOLERANCE,
         },
         "simulators": compare_simulators(prepared, [read_row(study.failures, prepared.problem, row) for row in rows]),
-        "computed_again": _describe_again(AGAIN, differing, again if isinstance(again, str) else ""),
+        "computed_again": {"what": AGAIN, "differing": differing, "reason": again if isinstance(again, str) else ""},
         "warnings": list(dict.fromkeys(warnings)),
         "files_changed": study.changed_files if study.about.get("results") else None,
         "changed": list(dict.fromkeys([*study.changed_files, *forged, *filed])),
@@ -432,23 +365,19 @@ def validate(
 def compare_simulators(study: Study, failures: Sequence[FloatArray]) -> dict[str, Any]:
     """Return how far the compiled simulator and the one of torch agree, in failures and in ordinary scenarios."""
     about: dict[str, Any] = {"what": "failures and ordinary scenarios by the compiled simulator and by torch"}
-    if study.problem.core != "numba" or study.problem.varies:
-        reason = "the ego's answers vary" if study.problem.varies else "this question is simulated by torch alone"
-        return {**about, "compared": 0, "failures_differing": None, "reason": reason}
+    about |= {"compared": 0, "failures_differing": None, "reason": ""}
+    if study.problem.varies:
+        return about | {"reason": "the ego's answers vary"}
+    if study.problem.core != "numba":
+        return about | {"reason": "this question is simulated by torch alone"}
     x = study.problem.space.sample(N_COMPARED, np.random.default_rng(study.question.seed))
     x = np.vstack([x, *failures])
     other = prepare(replace(study.question, core="torch", device="cpu"), study.problem.ego).problem
     compiled, reference = study.problem.evaluate(x), other.evaluate(x)
     fail = [f <= study.question.gamma for f in (compiled, reference)]
-    either = int(np.sum(fail[0] | fail[1]))
-    return {
-        **about,
-        "compared": len(x),
-        "failing_in_either": either,
-        "failures_differing": int(np.sum(fail[0] != fail[1])) if either else None,
-        "largest_difference_of_f": float(np.abs(compiled - reference).max()),
-        "reason": "",
-    }
+    either, differing = int(np.sum(fail[0] | fail[1])), int(np.sum(fail[0] != fail[1]))
+    about |= {"compared": len(x), "failing_in_either": either, "failures_differing": differing if either else None}
+    return about | {"largest_difference_of_f": float(np.abs(compiled - reference).max())}
 
 
 def describe_traffic_model(study: Study) -> dict[str, Any]:
@@ -460,14 +389,13 @@ def describe_traffic_model(study: Study) -> dict[str, Any]:
     for check in fitted.checks:
         tails = poisson.cdf(check.recorded, check.expected), poisson.sf(check.recorded - 1, check.expected)
         checks.append({**asdict(check), "outside": bool(min(tails) < CHECK_TAIL)})
-    frequency = None if fitted.frequency is None else asdict(fitted.frequency)
     return {
         "name": study.base_name,
         "kind": "fitted to recorded events",
         "family": fitted.family,
         "recordings": fitted.fitted_to,
         "refits": len(fitted.refits),
-        "frequency": frequency,
+        "frequency": fitted.frequency and asdict(fitted.frequency),
         "checks": checks,
         "checks_outside": sum(check["outside"] for check in checks) if checks else None,
         "provenance": dict(fitted.record),
@@ -478,41 +406,31 @@ def write_test_cases(
     out: Path, study: LoadedStudy, prepared: Study, rows: Sequence[int], drives: Sequence[Drive]
 ) -> dict[str, Any]:
     """Write a test case for each failure, with its OpenSCENARIO files, and return all of them."""
-    modes = {mode.get("failure"): mode for mode in study.result.get("modes") or []}
+    shares = {mode.get("failure"): mode.get("of_failures") for mode in study.result.get("modes") or []}
     cases = [
-        _write_case(out, study, prepared, number, row, drive, modes.get(row))
+        _write_case(out / "test_cases" / f"{number:02d}.xosc", study, prepared, row, drive)
+        | {"share_of_p": shares.get(row)}
         for number, (row, drive) in enumerate(zip(rows, drives, strict=True))
     ]
-    listed = {case["failure"] for case in cases}
     return {
         "about": "fields after ISO 34505: objective, scenario, initial conditions, expected and actual result; the ego "
         "of NN.xosc is free, for the system under test, the others move as they did; in NN_recorded.xosc it does too",
         "cases": cases,
-        "modes_without_case": sum(row not in listed for row in modes) if modes else None,
+        "modes_without_case": sum(row not in rows for row in shares) if shares else None,
     }
 
 
-def _write_case(
-    out: Path,
-    study: LoadedStudy,
-    prepared: Study,
-    number: int,
-    row: int,
-    drive: Drive,
-    mode: Mapping[str, Any] | None,
-) -> dict[str, Any]:
+def _write_case(place: Path, study: LoadedStudy, prepared: Study, row: int, drive: Drive) -> dict[str, Any]:
     """Write the files of a test case and return its fields."""
-    question, space = prepared.question, prepared.problem.space
-    name = f"{Path(study.folder).resolve().name}-{number:02d}"
-    about, place = {"f": repr(drive.f)}, out / "test_cases" / f"{number:02d}.xosc"
-    x = read_row(study.failures, prepared.problem, row)
-    files = export_drive(drive_again(prepared.problem, x, beyond=True), place, ego="free", properties=about)
+    question, problem, about = prepared.question, prepared.problem, {"f": repr(drive.f)}
+    x, space = read_row(study.failures, problem, row), problem.space
+    files = export_drive(drive_again(problem, x, beyond=True), place, ego="free", properties=about)
     files += export_drive(drive, place.with_stem(f"{place.stem}_recorded"), properties=about)
     crash = study.failures["crash"][row] if "crash" in study.failures else ""
     return {
-        "id": name,
+        "id": f"{Path(study.folder).resolve().name}-{place.stem}",
         "objective": f"The ego passes this scenario without {question.measure} <= {question.gamma:g}.",
-        "scenario_category": prepared.problem.world.scenario.name,
+        "scenario_category": problem.world.scenario.name,
         "test_environment": {"simulator": study.about.get("versions"), "scenario": question.env_id},
         "parameters": {key: value for key, value in space.named(x).items() if np.size(value) == 1},
         "units": dict(zip(space.names, space.units, strict=True)),
@@ -525,25 +443,19 @@ def _write_case(
         "expected_result": f"{question.measure} > {question.gamma:g} up to the end of the scenario",
         "actual_result": {"f": drive.f, "ends_after_s": float(drive.time[-1]), "kind": describe_kind(str(crash))},
         "log_density": float(study.failures["log_p0"][row]),
-        "share_of_p": None if mode is None else mode.get("of_failures"),
         "failure": row,
-        "files": [str(path.relative_to(out)) for path in files],
+        "files": [str(path.relative_to(place.parents[1])) for path in files],
     }
-
-
-def describe_origin(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what made a run and how to make it again: command, seeds, versions, files of its ego, by study.json."""
-    names = ("command", "begun", "finished", "seed", "ego", "base", "versions", "files")
-    return {name: about.get(name) for name in names}
 
 
 def describe_sum(
     folder: Path, recorded: Mapping[str, Any], reports: Mapping[str, Report | str], filed: Sequence[str]
-) -> dict[str, dict[str, Any]]:
+) -> Files:
     """Return the files of the evidence of a risk by name, from risk.json, and the evidence and reports of its runs."""
-    parts = {name: {key: read_object(folder / name / EVIDENCE / key) for key in FILES} for name in reports}
+    parts = [folder / name / EVIDENCE for name in reports]
     coverage, uncertainty, validation, origin = (
-        {name: part[key] for name, part in parts.items()} for key in (COVERAGE, UNCERTAINTY, VALIDATION, ORIGIN)
+        {part.parent.name: claims.read_object(part / key) for part in parts}
+        for key in (claims.COVERAGE, claims.UNCERTAINTY, claims.VALIDATION, claims.ORIGIN)
     )
     cells = [cell for each in coverage.values() for cell in each["iso_34502"]["covered"]]
     dropped = find_dropped(folder, recorded)
@@ -564,37 +476,37 @@ def describe_sum(
         }
         for name, each in recorded["scenarios"].items()
     ]
-    limited, first = [rate["limited"] for rate in rates], next(iter(parts.values()))
+    limited, first = [rate["limited"] for rate in rates], next(iter(reports))
     return {
-        COVERAGE: {
-            **{key: first[COVERAGE][key] for key in ("statement", "also_not_covered", "counted")},
-            "scenarios": {name: f"{name}/{EVIDENCE}/{COVERAGE}" for name in parts},
+        claims.COVERAGE: {
+            **{key: coverage[first][key] for key in ("statement", "also_not_covered", "counted")},
+            "scenarios": {name: f"{name}/{EVIDENCE}/{claims.COVERAGE}" for name in reports},
             "iso_34502": {"covered": cells, "not_covered": [cell for cell in CELLS if cell not in cells]},
             "left_out": left_out,
         },
-        UNCERTAINTY: {
+        claims.UNCERTAINTY: {
             **{key: recorded[key] for key in ("per_million_km", "interval_per_million_km", "confidence")},
             "rates": rates,
             "limited": None if None in limited else all(limited),
             "shares_of_variance": recorded["shares_of_variance"],
             "calibration": [one for each in uncertainty.values() for one in each["calibration"]],
-            "left_out": first[UNCERTAINTY]["left_out"],
+            "left_out": uncertainty[first]["left_out"],
         },
-        VALIDATION: {
-            "computed_again": _describe_again(SUM_AGAIN, differing, reason),
+        claims.VALIDATION: {
+            "computed_again": {"what": SUM_AGAIN, "differing": differing, "reason": reason},
             "warnings": recorded["warnings"],
             "changed": list(dict.fromkeys([*forged, *changed, *filed])),
         },
-        ORIGIN: {**first[ORIGIN], "base": {name: each["base"] for name, each in origin.items()}},
+        claims.ORIGIN: {**origin[first], "base": {name: each["base"] for name, each in origin.items()}},
     }
 
 
 def find_dropped(folder: Path, recorded: Mapping[str, Any]) -> dict[str, str]:
     """Return scenarios that risk.json does not name, by name: their runs lie there, or its runs say they were asked."""
     runs = [path.parent.name for path in folder.glob(f"*/{STUDY}")]
-    asked = [name for run in recorded["scenarios"] for name in read_object(folder / run / STUDY).get("scenarios") or ()]
+    asked = [claims.read_object(folder / run / STUDY).get("scenarios") or () for run in recorded["scenarios"]]
     # code that a folder names is not imported for its name
-    names = {*runs, *(find_scenario(env_id_of(str(name).rpartition(":")[2])).name for name in asked)}
+    names = {*runs, *(find_scenario(env_id_of(str(name).rpartition(":")[2])).name for name in chain(*asked))}
     missing = sorted(names - {*recorded["scenarios"], *recorded["left_out"]})
     return dict.fromkeys(missing, f"it is in the folder, or was asked for, and {RISK} does not have it")
 
@@ -616,18 +528,3 @@ def add_again(
     for part in (*kept.values(), *again["scenarios"].values()):
         part.pop("report", None)  # which its own evidence compares
     return list_differences({**recorded, "scenarios": kept}, again), ""
-
-
-def render(title: str, answer: Sequence[str], content: Mapping[str, Any], picture: str) -> str:
-    """Return the page."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("rare_envs.study.html_report"), autoescape=True, trim_blocks=True
-    )
-    page = environment.get_template("evidence.html.j2").render(
-        title=title,
-        answer=answer,
-        disclaimer=DISCLAIMER,
-        picture=Markup(picture[picture.index("<svg") :]),  # of this program, its texts escaped
-        **{name.removesuffix(".json"): value for name, value in content.items()},
-    )
-    return clean_text(page)

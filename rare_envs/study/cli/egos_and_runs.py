@@ -200,14 +200,14 @@ def report_command(
     force: ForceOption = False,
 ) -> Answer:
     """Write the report of a run, a risk or a comparison as one HTML file, with films of its failures."""
-    from rare_envs.study.evidence import digest_manifest, list_changes, write_evidence
+    from rare_envs.study.evidence import sum_up, write_evidence
     from rare_envs.study.html_report import write_html_report
     from rare_envs.study.run_folder import MOST_NAMED
 
     refuse_existing(force, out, out and out.parent / "figures" if figures else None)
     files = write_evidence(folder, **asked) if evidence else ()
     page, *drawn = write_html_report(folder, events=events, out=out, figures=figures, **asked)
-    filed, changed = [str(path) for path in files], list_changes(files) if files else []
+    filed, (changed, manifest, digest) = [str(path) for path in files], sum_up(files) if files else ([], "", "")
     text = f"Wrote {page}{f' and {len(drawn)} figures' if drawn else ''}."
     text += "".join(f"\nWrote {path} and the files beside it." for path in filed if path.endswith(".html"))
     if changed:
@@ -216,8 +216,8 @@ def report_command(
         text += f"\nChanged since they were written, or not what is computed again: {named}."
     data = {"report": str(page), "figures": [str(path) for path in drawn], "evidence": filed, "changed": changed}
     if files:
-        manifest, data["sha256"] = digest_manifest(files)
-        text += f"\nKeep elsewhere, as it has the digests of all: {manifest}, SHA-256 {data['sha256']}"
+        data["sha256"] = digest
+        text += f"\nKeep elsewhere, as it has the digests of all: {manifest}, SHA-256 {digest}"
     return Answer(data, text, DOUBTFUL if changed else 0)
 
 

@@ -250,14 +250,14 @@ def write_html_report(
         else:
             content = (_describe_risk if name == RISK else _describe_comparison)(folder, trust)
         with _damage_as_bad_input(folder):
-            written = clean_text(_environment().get_template(f"{Path(name).stem}.html.j2").render(content))
+            written = render(f"{Path(name).stem}.html.j2", content)
         with as_bad_input(OSError):
             replace_text(page, written)
             return [page, *(each.save(page.parent / "figures", figures) for each in content["drawn"] if figures)]
 
 
-def _environment() -> jinja2.Environment:
-    """Return what renders the templates; everything that files say is escaped."""
+def render(template: str, content: Mapping[str, Any]) -> str:
+    """Return a page by the name of its template; everything that files say is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rare_envs.study.html_report"),
         autoescape=True,
@@ -280,7 +280,7 @@ def _environment() -> jinja2.Environment:
         "with_interval": text.format_with_interval,
         "roles": {**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
     }
-    return environment
+    return clean_text(environment.get_template(template).render(content))
 
 
 def _load(folder: Path) -> LoadedStudy:

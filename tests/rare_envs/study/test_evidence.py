@@ -19,7 +19,8 @@ from typer.testing import Result
 
 from rare_envs.files import digest_file
 from rare_envs.study import BadInput, Question, claims, prepare, run_into
-from rare_envs.study.evidence import CELLS, EVIDENCE, SCHEMA, find_changed, judge_leaf, write_evidence
+from rare_envs.study.claims import find_changed, judge_leaf
+from rare_envs.study.evidence import CELLS, EVIDENCE, SCHEMA, write_evidence
 from rare_envs.study.run_folder import COMPARISON, RESULT, RISK, STUDY
 
 
