@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -116,16 +116,30 @@ class ModuleEgo:
         return actions
 
 
+def _list_calls(module: torch.nn.Module) -> Iterator[dict[str, Any]]:
+    """Yield the constant arguments, by name, of each operation in programs of torch.export and TorchScript."""
+    for part in module.modules():
+        if isinstance(part, torch.fx.GraphModule):
+            for node in part.graph.nodes:
+                schema = getattr(node.target, "_schema", None)
+                names = [argument.name for argument in getattr(schema, "arguments", ())]
+                yield {**dict(zip(names, node.args, strict=False)), **node.kwargs}
+        elif graph := getattr(part, "inlined_graph", None):
+            for node in (node for kind in _TRAINED for node in graph.findAllNodes(f"aten::{kind}")):
+                names = [argument.name for argument in torch._C.parse_schema(node.schema()).arguments]
+                yield dict(zip(names, (given.toIValue() for given in node.inputs()), strict=False))
+
+
+_TRAINED = "dropout feature_dropout alpha_dropout feature_alpha_dropout batch_norm lstm gru rnn_tanh rnn_relu".split()
+"""Operations that do something else in training, as TorchScript names them."""
+
+
 def _was_exported_in_training(module: torch.nn.Module) -> bool:
     """Return whether a program, or one inside, keeps its dropout or the statistics of each batch in evaluation."""
-    programs = (part for part in module.modules() if isinstance(part, torch.fx.GraphModule))
-    for node in (node for program in programs for node in program.graph.nodes):
-        names = [argument.name for argument in getattr(getattr(node.target, "_schema", None), "arguments", ())]
-        given = {**dict(zip(names, node.args, strict=False)), **node.kwargs}
-        trains = given.get("train") is True or given.get("training") is True
-        if trains and given.get("dropout", given.get("p")) != 0:
-            return True
-    return False
+    return any(
+        (given.get("train") is True or given.get("training") is True) and given.get("dropout", given.get("p")) != 0
+        for given in _list_calls(module)
+    )
 
 
 _ONE_OUTPUT = (
@@ -178,7 +192,8 @@ def wrap_callable(ego: Any) -> Any:
         found = f"{type(ego).__name__} without; return {part}a function from observations to actions"
         raise ValueError(f"Expected a module with forward, got {found}.")
     if _was_exported_in_training(ego):
-        raise ValueError("Expected a program of evaluation mode, got one of training mode: eval() before torch.export.")
+        words = "Expected a program of evaluation mode, got one of training mode"
+        raise ValueError(f"{words}: eval() before torch.export or torch.jit.trace.")
     return ModuleEgo(ego, *declared)
 
 
@@ -195,7 +210,7 @@ def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
     if isinstance(observed, spaces.Dict):
         names = set(observed.spaces)
         return (read_kinds(sorted(names)),) if names and names <= set(OBSERVATIONS) else ()
-    if _shows_pictures(observed):
+    if find_picture_size(observed):
         return ("camera",)
     found = {kind: find_frame_stacking(observation_space(vehicles, kind), observed) for kind in OBSERVATIONS}
     single = tuple(kind for kind, frames in found.items() if frames == (1, False))
@@ -203,12 +218,18 @@ def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
     return single or tuple(kind for kind, frames in found.items() if frames is not None and kind not in unlike)
 
 
-def _shows_pictures(observed: Any) -> bool:
-    """Return whether a space is that of coloured pictures; channels, the shorter axis, are first or last."""
+def find_picture_size(observed: Any) -> tuple[int, int] | None:
+    """Return the height and width of the coloured pictures of a space, or of its part "camera"; None without such.
+
+    Channels, the shorter axis, are first or last.
+    """
+    observed = observed.spaces.get("camera") if isinstance(observed, spaces.Dict) else observed
     shape = getattr(observed, "shape", None)  # whatever a user's ego declares
-    if not isinstance(shape, tuple) or getattr(observed, "dtype", None) != np.uint8:
-        return False
-    return len(shape) in (3, 4) and min(shape[-1], shape[-3]) in _COLOUR_CHANNELS
+    if not isinstance(shape, tuple) or getattr(observed, "dtype", None) != np.uint8 or len(shape) not in (3, 4):
+        return None
+    first = shape[-3] < shape[-1]
+    height, width = shape[-2:] if first else shape[-3:-1]
+    return (int(height), int(width)) if shape[-3 if first else -1] in _COLOUR_CHANNELS else None
 
 
 def choose_observation(needs: EgoNeeds, vehicles: int) -> str:

@@ -25,6 +25,7 @@ from rare_envs.egos.needs import (
     ModuleEgo,
     choose_action,
     choose_observation,
+    find_picture_size,
     find_rule_based,
     load_named_ego,
     resolve,
@@ -304,10 +305,14 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
     observed, acted = (getattr(ego, f"{name}_space", None) for name in ("observation", "action"))  # anybody's object
     if observed is not None and find_frame_stacking(expected, observed) is None:
         which = "another observation" if declared == "features" else f"observation={declared!r}"
-        raise ValueError(
-            f"The ego expects observations {observed}, the environment gives {expected}; "
-            f"train it in this environment or choose {which}."
-        )
+        advice = f"train it in this environment or choose {which}"
+        size, given = find_picture_size(observed), find_picture_size(expected)
+        if size and given and size != given:
+            advice = (
+                f"the camera gives {given[0]} x {given[1]} pixels, in Python camera={size} gives the ego's; on the "
+                "command line name module:function, an ego that resizes them"
+            )
+        raise ValueError(f"The ego expects observations {observed}, the environment gives {expected}; {advice}.")
     several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
     accelerates = getattr(acted, "shape", None) == (2,) and not several
     if acted is None or takes_indices(acted) or (accelerates and action == "continuous"):

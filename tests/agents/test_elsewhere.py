@@ -77,6 +77,7 @@ def test_weights_alone_drive_through_a_function(file: str, head: str, outputs: i
         np.testing.assert_allclose(ego.predict(seen)[0], expected, atol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning", "ignore::torch.jit.TracerWarning")
 def test_an_exported_program_drives_and_a_module_without_forward_names_its_parts(seen: Any) -> None:
     agent, rows = nn.ModuleDict({"critic": nn.Linear(11, 1), "actor": nn.Linear(11, 2)}), {0: torch.export.Dim("rows")}
     expected = agent["actor"](torch.from_numpy(seen)).numpy(force=True)
@@ -93,8 +94,12 @@ def test_an_exported_program_drives_and_a_module_without_forward_names_its_parts
         for training in (True, False):
             network = nn.Sequential(agent["actor"], layer).train(training)
             program = torch.export.export(network, (torch.zeros(2, 11),), dynamic_shapes=(rows,))
-            with pytest.raises(ValueError, match=r"eval\(\) bef") if refused and training else nullcontext():
-                wrap_callable(program.module())
+            traced = torch.jit.trace(network, torch.zeros(2, 11), check_trace=False)
+            for each in (program.module(), nn.Sequential(traced)):
+                with pytest.raises(ValueError, match=r"eval\(\) bef") if refused and training else nullcontext():
+                    wrap_callable(each)
+            scripted = wrap_callable(torch.jit.script(network))  # which knows both modes
+            np.testing.assert_array_equal(scripted.predict(seen)[0], scripted.predict(seen)[0])
     for module, part in ((agent, r"the part of it that acts \(critic, actor\), or "), (nn.Module(), "")):
         with pytest.raises(ValueError, match=rf"got {type(module).__name__} without; return {part}a function from"):
             DrivingProblem("rare_envs/CutIn-v0", ego=module)

@@ -91,6 +91,20 @@ def test_several_or_none_are_refused_in_a_line() -> None:
         assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("shape", [(64, 80, 3), (12, 64, 80)])
+@pytest.mark.parametrize("named", [False, True])
+def test_pictures_of_another_size_are_refused_by_both_sizes_and_a_camera_gives_them(
+    shape: tuple[int, ...], named: bool
+) -> None:
+    space: spaces.Space[Any] = spaces.Box(0, 255, shape, np.uint8)
+    ego = idle(spaces.Dict({"camera": space, "speed": observation_space(3, "speed")}) if named else space)
+    words = r"^The ego.*; the camera gives 66 x 200 pixels, in Python camera=\(64, 80\) .* module:function, .* resizes"
+    with pytest.raises(ValueError, match=words):
+        rare_envs.DrivingProblem(CUT_IN, ego=ego)
+    if not named or shape[-1] == 3:
+        rare_envs.DrivingProblem(CUT_IN, ego=ego, camera=(64, 80))
+
+
 def test_a_policy_of_highway_env_says_by_its_id_or_by_hand_what_its_actions_are() -> None:
     ego = idle(observation_space(3, "kinematics"), spaces.Discrete(5))
     with pytest.raises(ValueError, match=r"fit two kinds.*--action meta.*--action discrete"):
