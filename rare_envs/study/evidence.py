@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib import resources
 from itertools import chain, product
@@ -222,13 +222,24 @@ def compute_again(study: LoadedStudy, prepared: Study) -> Report | str:
 def list_differences(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
     """Return what of a recorded result is not what was computed again, by name."""
     found = json.loads(format_json(to_json_value(again)))
-    return [name for name in found if name not in NOT_COMPUTED and not _agree(recorded.get(name), found[name])]
+    known = {name: value for name, value in found.items() if name not in NOT_COMPUTED}
+    return list(_list_apart({name: recorded.get(name) for name in known}, known))
+
+
+def _list_apart(a: Mapping[str, Any], b: Mapping[str, Any], place: str = "") -> Iterator[str]:
+    """Yield the names, such as "rate.p", of what is in one of two mappings alone or differs between them."""
+    for name in dict.fromkeys((*b, *a)):
+        one, other = a.get(name, ...), b.get(name, ...)
+        if isinstance(one, dict) and isinstance(other, dict):
+            yield from _list_apart(one, other, f"{place}{name}.")
+        elif not _agree(one, other):
+            yield f"{place}{name}"
 
 
 def _agree(a: Any, b: Any) -> bool:
     """Return whether values of JSON are equal, numbers up to rounding."""
     if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_agree(a[name], b[name]) for name in a)
+        return not [*_list_apart(a, b)]
     if isinstance(a, list) and isinstance(b, list):
         return len(a) == len(b) and all(map(_agree, a, b))
     if isinstance(a, float) and isinstance(b, int | float):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import samplers
 from agents.saved_ego import SavedEgo
@@ -20,7 +18,6 @@ from rare_envs.measures.base import Measure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.people import COUNTED, EventCalibration, EventRate, calibration
 from rare_envs.scenarios.registry import complete_id, find_scenario
-from rare_envs.startup import __version__
 from rare_envs.study.arguments import Question
 from rare_envs.study.failures import CrashKinds
 from rare_envs.study.question import Study
@@ -232,8 +229,7 @@ class Report:
         ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
         ... )
         >>> report = run(prepare(question))
-        >>> answer = report.to_dict()
-        >>> answer["n_failures"], answer["doubtful"], answer["failures"][0]["crash"]
+        >>> report.estimate.failures.total, report.doubtful, report.crashes[0]
         (21, False, None)
     """
 
@@ -472,66 +468,3 @@ class Report:
             except ValueError as error:
                 found[name] = str(error)
         return found
-
-    def to_dict(self, top: int = 10) -> dict[str, Any]:
-        """Return JSON-ready values: question, estimate, the `top` most likely failures; `report_as_json` adds text."""
-        failures, space = self.estimate.failures, self.study.problem.space
-        listed = itertools.islice(zip(failures, self.crashes, strict=True), top)
-
-        def convert(value: Any) -> Any:
-            return None if value is None else value.to_dict()
-
-        return {
-            **self.estimate.to_dict(),
-            "question": asdict(self.study.question),
-            "average": self.average,
-            "proviso": self.estimate.proviso,
-            "gate": convert(self.verdict),
-            "doubtful": self.doubtful,
-            "doubts": self.warnings,
-            "notes": self.notes,
-            "vec_normalize": self.vec_normalize,
-            "doubt_of_statistics": self.doubt_of_statistics,
-            "seconds": self.seconds,
-            "earlier_seconds": self.earlier_seconds,
-            "n_failures": failures.total,
-            "kinds": {
-                kind: {
-                    **share.to_dict(),
-                    "other_drivers": {n: each._asdict() for n, each in self.kinds.find_others(kind).items()},
-                }
-                for kind, share in self.kinds.shares.items()
-            },
-            "other_drivers": {name: each._asdict() for name, each in self.kinds.find_others().items()},
-            "n_other_drivers": self.kinds.n_others,
-            "modes": [mode.to_dict() for mode in self.kinds.modes],
-            "curve": convert(self.curve),
-            "severity": convert(self.kinds.severity),
-            "sensitivity": None if isinstance(self.sensitivity, str | None) else self.sensitivity.to_dict(),
-            "failures": [
-                {
-                    "parameters": self._parameters(one.x),
-                    "f": one.f if math.isfinite(one.f) else None,
-                    "log_p0": one.log_p0,
-                    "crash": crash,
-                }
-                for one, crash in listed
-            ],
-            "n_faults": len(self.faults),
-            "n_retried": self.n_retried,
-            "repeatability": None if self.repeatability is None else self.repeatability.to_dict(),
-            "faults": [{"parameters": self._parameters(one.x), "reason": one.reason} for one in self.faults[:top]],
-            "units": dict(zip(space.names, space.units, strict=True)),
-            "rate": convert(self.rate),
-            "events": [each.to_dict() for each in self.events],
-            "injury_rate": convert(self.injury_rate),
-            "no_rate": self.no_rate,
-            "other_bases": [
-                {"base": name, **({"refused": found} if isinstance(found, str) else {"refused": "", **found.to_dict()})}
-                for name, found in self.other_bases.items()
-            ],
-            "version": __version__,
-        }
-
-    def _parameters(self, x: NDArray[np.float64]) -> dict[str, Any]:
-        return {name: np.asarray(value).tolist() for name, value in self.study.problem.space.named(x).items()}

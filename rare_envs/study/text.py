@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import shlex
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from rare_envs.measures import MEASURES
 from rare_envs.people import MODEL, NO_HEADWAY_RULE, EventRate, sum_people
 from rare_envs.plugins import clean_text
 from rare_envs.scenarios.cut_in import ATTENTION_LIMIT, CUTTER
+from rare_envs.startup import __version__
 from rare_envs.study.arguments import GATE_CODES, Question
 from rare_envs.study.episodes import MAX_SHOWN, Column, draw_ordinary, find_ordinary_range, format_value, list_columns
 from rare_envs.study.failures import KIND_DESCRIPTIONS
@@ -397,9 +399,69 @@ def list_avoided(kinds: Mapping[str, tuple[float, float]], a: str, b: str) -> li
     return [("Avoided", say("avoided", a=a, b=b, share=share, kinds=", ".join(parts)))]
 
 
-def report_as_json(report: Report) -> dict[str, Any]:
-    """Return a report as values of JSON, with the whole answer as `text`."""
-    return {**report.to_dict(), "text": [*describe_answer(report, most=WHOLE), *list_gate(report.verdict)]}
+def report_as_json(report: Report, top: int = 10) -> dict[str, Any]:
+    """Return JSON-ready values: question, estimate, the `top` most likely failures, the whole answer as `text`."""
+    failures, kinds, space = report.estimate.failures, report.kinds, report.study.problem.space
+    listed = itertools.islice(zip(failures, report.crashes, strict=True), top)
+
+    def convert(value: Any) -> Any:
+        return None if value is None else value.to_dict()
+
+    def name_values(x: FloatArray) -> dict[str, Any]:
+        return {name: np.asarray(value).tolist() for name, value in space.named(x).items()}
+
+    return {
+        **report.estimate.to_dict(),
+        "question": asdict(report.study.question),
+        "average": report.average,
+        "proviso": report.estimate.proviso,
+        "gate": convert(report.verdict),
+        "doubtful": report.doubtful,
+        "doubts": report.warnings,
+        "notes": report.notes,
+        "vec_normalize": report.vec_normalize,
+        "doubt_of_statistics": report.doubt_of_statistics,
+        "seconds": report.seconds,
+        "earlier_seconds": report.earlier_seconds,
+        "n_failures": failures.total,
+        "kinds": {
+            kind: {
+                **share.to_dict(),
+                "other_drivers": {n: each._asdict() for n, each in kinds.find_others(kind).items()},
+            }
+            for kind, share in kinds.shares.items()
+        },
+        "other_drivers": {name: each._asdict() for name, each in kinds.find_others().items()},
+        "n_other_drivers": kinds.n_others,
+        "modes": [mode.to_dict() for mode in kinds.modes],
+        "curve": convert(report.curve),
+        "severity": convert(kinds.severity),
+        "sensitivity": None if isinstance(report.sensitivity, str) else convert(report.sensitivity),
+        "failures": [
+            {
+                "parameters": name_values(one.x),
+                "f": one.f if math.isfinite(one.f) else None,
+                "log_p0": one.log_p0,
+                "crash": crash,
+            }
+            for one, crash in listed
+        ],
+        "n_faults": len(report.faults),
+        "n_retried": report.n_retried,
+        "repeatability": convert(report.repeatability),
+        "faults": [{"parameters": name_values(one.x), "reason": one.reason} for one in report.faults[:top]],
+        "units": dict(zip(space.names, space.units, strict=True)),
+        "rate": convert(report.rate),
+        "events": [each.to_dict() for each in report.events],
+        "injury_rate": convert(report.injury_rate),
+        "no_rate": report.no_rate,
+        "other_bases": [
+            {"base": name, **({"refused": found} if isinstance(found, str) else {"refused": "", **found.to_dict()})}
+            for name, found in report.other_bases.items()
+        ],
+        "version": __version__,
+        "text": [*describe_answer(report, most=WHOLE), *list_gate(report.verdict)],
+    }
 
 
 def name_p(question: Question) -> str:

@@ -41,6 +41,7 @@ from rare_envs.study.question import (
     CHANGEABLE,
     Study,
     digest_files,
+    find_changed_files,
     find_ego_files,
     is_same_question,
     note_question,
@@ -93,12 +94,15 @@ def begin_journal(
 
 def _continue_same(folder: Path, head: dict[str, Any]) -> Journal:
     """Return the journal of an unfinished run of the question and files of a head, in the batches of its beginning."""
-    journal, _ = continue_journal(folder)
-    if _of_any_chunk(journal.head) == _of_any_chunk(json.loads(json.dumps(head))):
+    journal, begun = continue_journal(folder)
+    before, now = _flatten_head(journal.head, asdict(begun)), _flatten_head(json.loads(json.dumps(head)))
+    other = [name for name in dict.fromkeys((*now, *before)) if before.get(name) != now.get(name)]
+    other += find_changed_files(journal.head.get("files") or {}, head["files"])
+    if not other:
         note_on_error(journal, head["question"]["on_error"])
         return journal
     journal.close()
-    raise BadInput(f"The run in {str(folder)!r} is of another question, or of other files: replace it by --force.")
+    raise BadInput(f"The run in {str(folder)!r} was begun with another {', '.join(other)}: replace it by --force.")
 
 
 def note_on_error(journal: Journal, on_error: str) -> None:
@@ -109,10 +113,11 @@ def note_on_error(journal: Journal, on_error: str) -> None:
             journal.amend({**journal.head, "question": {**asked, "on_error": on_error}})
 
 
-def _of_any_chunk(head: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a head without what a run that is continued may change, the size of batches included."""
-    question = {name: value for name, value in head["question"].items() if name not in ("chunk", *CHANGEABLE)}
-    return {**head, "question": question, "whole": dict(head.get("whole") or {}) | {"chunked": None}}
+def _flatten_head(head: Mapping[str, Any], question: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the question and command of a head, without what a run that is continued may change, batches included."""
+    whole = dict(head.get("whole") or {})
+    every = {**whole, **dict(whole.get("options") or {}), **(question or head["question"])}
+    return {name: value for name, value in every.items() if name not in ("options", "chunk", "chunked", *CHANGEABLE)}
 
 
 def find_whole(folder: Path, mend: bool = False) -> tuple[Path, dict[str, Any], dict[str, Question]]:

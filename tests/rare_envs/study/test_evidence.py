@@ -75,12 +75,12 @@ def test_the_result_follows_from_the_simulations_and_says_so_where_it_does_not(
     run: Path, tmp_path: Path, cli: Callable[..., Result]
 ) -> None:
     copy = shutil.copytree(run, tmp_path / "copy")
-    for folder, wanted in ((run, []), (copy, ["p", "interval", "rate"])):
+    for folder, wanted in ((run, []), (copy, ["p", "interval", "rate.interval_per_million_km"])):
         if folder == copy:  # p and limits that look better, signed again
             sign_again(copy, {"p": 1e-8, "interval": [0.0, 1e-7], "rate": {"interval_per_million_km": [0.0, 1e-2]}})  # type: ignore[dict-item]
             answer = cli("report", copy, "--evidence", "--json")
             assert answer.exit_code == 3
-            assert f"{RESULT} (p, interval, rate)" in json.loads(answer.stdout)["changed"]
+            assert f"{RESULT} (p, interval, rate.interval_per_million_km)" in json.loads(answer.stdout)["changed"]
         found: Any = read(folder)["validation.json"]["computed_again"]
         assert found["differing"] == wanted
         status = {leaf["pointer"]: leaf["status"] for leaf in list_leaves(folder)}

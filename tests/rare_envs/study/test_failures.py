@@ -29,6 +29,7 @@ from rare_envs.study.failures import (
 )
 from rare_envs.study.question import Study
 from rare_envs.study.run_folder import CRASH, read_failures
+from rare_envs.study.text import report_as_json
 from rare_envs.study.writing import write_run
 from rare_envs.traffic.crash import injury_risk
 from samplers.analysis import NO_OUTCOME_LABEL
@@ -206,7 +207,7 @@ def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
     report = make_report(Forgetful(), 200)
     assert report.kinds.shares == {}
     assert any("the ego has gone home" in note for note in report.notes)
-    assert report.to_dict()["failures"][0]["crash"] is None
+    assert report_as_json(report)["failures"][0]["crash"] is None
 
 
 def estimate_of(x: np.ndarray, gamma: float = 0.0) -> samplers.Estimate:

@@ -21,6 +21,7 @@ from rare_envs.study import BadInput, Question, evaluate, prepare, run, writing
 from rare_envs.study.evaluate import KEPT_ROWS, ROWS_ALONE
 from rare_envs.study.report import Report
 from rare_envs.study.run_folder import JOURNAL
+from rare_envs.study.text import report_as_json
 from samplers.evaluate import Evaluator
 from samplers.run import Progress
 from tests.rare_envs.study.refusals import act_after, interrupt
@@ -229,7 +230,7 @@ def test_an_ego_without_an_f_is_noticed(ego: type[Braking]) -> None:
     assert report.doubtful
     (warning,) = (text for text in report.warnings if "when repeated in another order" in text)
     assert f"of {KEPT_ROWS + ROWS_ALONE} simulations" in warning
-    answer = report.to_dict()
+    answer = report_as_json(report)
     assert answer["repeatability"]["n_differing"] > 3 and warning in answer["doubts"]
 
 

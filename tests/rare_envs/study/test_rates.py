@@ -33,6 +33,7 @@ from rare_envs.study.text import (
     format_rate,
     format_with_interval,
     is_better_known,
+    report_as_json,
     tabulate_events,
 )
 from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted, write_stratified
@@ -59,7 +60,7 @@ def test_the_rate_is_p_times_the_frequency_with_the_interval_by_hand(bases: dict
     half = math.hypot(base, stats.norm.ppf(0.975) / math.sqrt(42))
     assert rate.interval_per_million_km[0] == pytest.approx(rate.per_million_km * math.exp(-half))
     assert math.log(estimate.p / uncertainty.interval[0]) == pytest.approx(base)
-    assert report.to_dict()["rate"]["per_million_km"] == rate.per_million_km
+    assert report_as_json(report)["rate"]["per_million_km"] == rate.per_million_km
     assert report.no_rate == ""
 
 
@@ -301,7 +302,7 @@ def test_an_event_that_is_not_resolved_has_the_upper_end_of_its_stratum(tmp_path
 def event_of(base: str | None, env_id: str = "rare_envs/CutIn-v1", **changes):
     asked = Question(env_id=env_id, base=base, method="mc", max_sim=100, **changes)
     report = run(prepare(asked))
-    assert report.to_dict()["events"][0]["uncalibrated"] == report.events[0].uncalibrated
+    assert report_as_json(report)["events"][0]["uncalibrated"] == report.events[0].uncalibrated
     return report.events[0]
 
 

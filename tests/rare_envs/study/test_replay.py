@@ -26,6 +26,7 @@ from rare_envs.study.plots import (
     write_film,
 )
 from rare_envs.study.replay import describe_drive, drive_again, find_failure
+from rare_envs.study.text import report_as_json
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, full_disk, in_file
 
 CUT_IN, NEWEST = "rare_envs/CutIn-v0", "rare_envs/CutIn-v1"
@@ -163,6 +164,6 @@ def test_without_failures_a_note_says_why_there_is_no_sensitivity() -> None:
     for asked in (False, True):
         study = prepare(Question(env_id=FOLLOWING, method="mc", max_sim=50, sensitivity=asked))
         report = Report(study, samplers.estimate(study.problem, "mc", max_sim=50, seed=0), 1.0)
-        assert report.to_dict()["sensitivity"] is None
+        assert report_as_json(report)["sensitivity"] is None
         note = "sensitivity is not known: No point failed (f <= 0): there is nothing to analyse."
         assert (note in report.notes) is asked

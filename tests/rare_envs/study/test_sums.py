@@ -83,7 +83,7 @@ def test_a_risk_that_was_stopped_is_resumed_or_goes_on_with_the_same_command(
     kept = f"30 simulations are kept; go on with: rare-envs resume {tmp_path / 'run'} Done before: cut_in "
     assert kept in stopped.stderr
     assert (tmp_path / "run" / "cut_in" / JOURNAL).exists() and not (tmp_path / "run" / "risk.json").exists()
-    assert_refused(cli(*words, tmp_path / "run", "--seed", 5), "is of another question", "--force")
+    assert_refused(cli(*words, tmp_path / "run", "--seed", 5), "was begun with another seed: replace", "--force")
     most[0], before = 2000, made[0]
     done = cli("resume", tmp_path / "run") if resumes else cli(*words, tmp_path / "run")
     assert done.exit_code in (0, 3) and done.stdout.startswith("idm: collisions per million km ")
