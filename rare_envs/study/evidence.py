@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib import resources
 from itertools import chain, product
@@ -45,8 +45,7 @@ from samplers.problem import EvaluationError, FloatArray
 Files = dict[str, dict[str, Any]]
 Known = claims.Digests
 PICTURE, PAGE, SCHEMA_FILE = "claims.svg", "evidence.html", "evidence.schema.json"
-_SCHEMA = resources.files("rare_envs") / "data" / "evidence_schema.json"
-SCHEMA: dict[str, Any] = json.loads(_SCHEMA.read_text("utf-8"))
+SCHEMA: dict[str, Any] = json.loads((resources.files("rare_envs") / "data/evidence_schema.json").read_text("utf-8"))
 """JSON schema of all files of the evidence together, {name: content}; of a run, or of a risk."""
 N_COMPARED, MOST_CASES = 1_000, 20
 """Ordinary scenarios that both simulators drive, and test cases at most."""
@@ -223,28 +222,19 @@ def list_differences(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> l
     """Return what of a recorded result is not what was computed again, by name."""
     found = json.loads(format_json(to_json_value(again)))
     known = {name: value for name, value in found.items() if name not in NOT_COMPUTED}
-    return list(_list_apart({name: recorded.get(name) for name in known}, known))
+    return _list_apart({name: recorded.get(name) for name in known}, known)
 
 
-def _list_apart(a: Mapping[str, Any], b: Mapping[str, Any], place: str = "") -> Iterator[str]:
-    """Yield the names, such as "rate.p", of what is in one of two mappings alone or differs between them."""
-    for name in dict.fromkeys((*b, *a)):
-        one, other = a.get(name, ...), b.get(name, ...)
-        if isinstance(one, dict) and isinstance(other, dict):
-            yield from _list_apart(one, other, f"{place}{name}.")
-        elif not _agree(one, other):
-            yield f"{place}{name}"
-
-
-def _agree(a: Any, b: Any) -> bool:
-    """Return whether values of JSON are equal, numbers up to rounding."""
+def _list_apart(a: Any, b: Any, place: str = "") -> list[str]:
+    """Return the names, such as "rate.p", of what differs between values of JSON, numbers by more than rounding."""
     if isinstance(a, dict) and isinstance(b, dict):
-        return not [*_list_apart(a, b)]
+        pairs = {name: (a.get(name, ...), b.get(name, ...)) for name in (*b, *a)}
+        return [each for name, pair in pairs.items() for each in _list_apart(*pair, f"{place}.{name}".lstrip("."))]
     if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(_agree, a, b))
-    if isinstance(a, float) and isinstance(b, int | float):
-        return math.isclose(a, b, rel_tol=EQUAL)
-    return bool(a == b)
+        equal = len(a) == len(b) and not any(map(_list_apart, a, b))
+    else:
+        equal = math.isclose(a, b, rel_tol=EQUAL) if isinstance(a, float) and isinstance(b, int | float) else a == b
+    return [] if equal else [place]
 
 
 def list_failures(study: LoadedStudy) -> list[int]:
@@ -257,8 +247,7 @@ def list_failures(study: LoadedStudy) -> list[int]:
 def describe_coverage(study: Study) -> dict[str, Any]:
     """Return the statement of what was covered: scenario categories, operational design domain, traffic."""
     question, problem = study.question, study.problem
-    scenario = problem.world.scenario
-    road = scenario.road
+    scenario, road = problem.world.scenario, problem.world.scenario.road
     curvature = max((abs(each) for each in road.reference_line.curvature), default=0.0) if road.reference_line else 0.0
     covered = [f"main roadway, lane keep, {motion}" for motion in _COVERED.get(scenario.name, ())]
     low, high = episodes.find_ordinary_range(episodes.draw_ordinary(problem.space))
