@@ -211,7 +211,8 @@ def train_ego(
     num_envs = hyperparameters.num_envs if num_envs is None else num_envs
     target, device = _prepare_target(Path(out)), make_kwargs.get("device", "cpu")
     arguments = {"env_id": ",".join(ids), "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
-    arguments |= {"even_strata": even_strata}
+    settings_digest = hashlib.sha256(repr(hyperparameters).encode()).hexdigest()[:8]
+    arguments |= {"even_strata": even_strata, "settings": settings_digest}
     arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
     arguments |= {} if retraining is None else retraining.arguments()
     checkpoint = target.with_suffix(CHECKPOINT_SUFFIX)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,9 +33,9 @@ from examples.demo import ENV_ID, random_collision_rate
 from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.startup import use_one_thread
-from training import sb3_vec_env, train_ego
+from training import ego_training, sb3_vec_env, train_ego
 from training.checkpoints import TrainingInterrupted, load_checkpoint
-from training.ego_training import Retraining, check_retrainable, restore_parameters
+from training.ego_training import HYPERPARAMETERS, Retraining, check_retrainable, restore_parameters
 
 ENV = "rare_envs/CutIn-v0"
 STEPS, ROWS = 64, 8
@@ -141,6 +142,11 @@ def test_a_resumed_training_ends_alike(
         train_ego(ids, out=tmp_path / "ego.zip", **common)
     with pytest.raises(ValueError, match=r"with other arguments \(seed=0\)"):
         train_ego(ids, out=tmp_path / "ego.zip", resume=True, **{**common, "seed": 1})
+    other = {algo: replace(HYPERPARAMETERS[algo], reward_scale=0.5)}
+    monkeypatch.setattr(ego_training, "HYPERPARAMETERS", other)
+    with pytest.raises(ValueError, match=r"with other arguments \(settings='\w{8}'\)"):
+        train_ego(ids, out=tmp_path / "ego.zip", resume=True, **common)
+    monkeypatch.undo()
     np.random.seed(5)  # noqa: NPY002  (what another process would have drawn of the global generators)
     torch.manual_seed(5)
     resumed = train_ego(ids, out=tmp_path / "ego.zip", resume=True, **common)
