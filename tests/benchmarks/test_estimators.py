@@ -10,17 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.estimators import against_truth
 from benchmarks.estimators.highway import gains
 from benchmarks.estimators.highway import truth as highway_truth
 from benchmarks.estimators.highway.truth import CASES, COUNTED_WORLDS, EARLIER_COUNTS, HighwayCase
 from benchmarks.estimators.truth import ROLLOUT_CHUNK, World, count_collisions, truth
 from rare_envs.simulation.world import rollout
-
-
-def read_rows(path: Path, key: str = "rows") -> list[dict[str, Any]]:
-    return json.loads(path.read_text())[key]  # type: ignore[no-any-return]
-
 
 # --- counted truth ---------------------------------------------------------------------------------
 
@@ -73,34 +67,6 @@ def test_counts_on_the_highway_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 # --- runs that are kept ----------------------------------------------------------------------------
-
-
-def test_rows_of_one_method_or_environment_are_made_anew_and_the_others_stay(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    calls: list[tuple[str, str]] = []
-
-    def compare(row: dict[str, Any], method: str, seeds: range) -> dict[str, Any]:
-        calls.append((row["env_id"], method))
-        figures = {"mean": row["p"], "z": 0.0, "coverage": 1.0, "cov": 0.1, "own_cov": 0.1, "n_sim": 100.0}
-        names = {"env_id": row["env_id"], "base": row["base"], "method": method}
-        return {**names, "seeds": len(seeds), "truth": row["p"], **figures, "gain": 7.0, "warned": 0.0}
-
-    monkeypatch.setattr(against_truth, "compare_with_truth", compare)
-    out = tmp_path / "cells.json"
-    against_truth.main(seeds=2, method="mc,adss", out=out)
-    before = read_rows(out, "cells")
-    out.write_text(json.dumps({"cells": [cell | {"gain": 1.0} for cell in before]}))
-    calls.clear()
-    against_truth.main(seeds=3, method="adss", out=out)
-    assert {method for _, method in calls} == {"adss"}
-    after = read_rows(out, "cells")
-    assert {cell["gain"] for cell in after if cell["method"] == "mc"} == {1.0}
-    assert {(cell["gain"], cell["seeds"]) for cell in after if cell["method"] == "adss"} == {(7.0, 3)}
-    assert [cell["method"] for cell in after] == [cell["method"] for cell in before]
-    calls.clear()
-    against_truth.main(seeds=2, env="CutIn", method="mc", out=tmp_path / "one.json")
-    assert {env_id for env_id, _ in calls} == {"rare_envs/CutIn-v0", "rare_envs/CutIn-v1"}
 
 
 HIGHWAY_RUNS: list[dict[str, Any]] = [

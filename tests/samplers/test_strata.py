@@ -72,13 +72,6 @@ def test_the_sum_is_exact(method, max_sim):
         assert part.interval[0] < norm.sf(AT[part.name]) < part.interval[1]
 
 
-@pytest.mark.slow
-def test_the_surrogate_adds_up():
-    result = samplers.estimate(even(at=(3.0, 2.0)), "surrogate", seed=1, max_sim=300)
-    assert result.interval[0] < exact((0.7, 0.3), (3.0, 2.0)) < result.interval[1] and result.n_sim <= 300
-    assert result.cov < 0.2
-
-
 def test_the_ends_are_those_of_zou_and_donner():
     def part(name, share, p, low, high):
         return Part(

@@ -15,7 +15,6 @@ from agents.learned.networks import (
     FEATURE_CLIP,
     HEAD_SIZE,
     HUMAN_NOISE,
-    RADIUS,
     AutoregressiveNoise,
     Policy,
     WeightDistribution,
@@ -27,7 +26,6 @@ from rare_envs.sensors.lidar import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
 from rare_envs.traffic.bodies import Lead
 from rare_envs.traffic.state import bicycle
-from samplers.distributions import announced_blocks
 from tests.agents.learned.test_collision_avoidance import seen
 
 
@@ -121,24 +119,6 @@ def test_maps_are_inverse_and_density_is_theirs(weight_distribution, rng):
         weight_distribution.covariance @ weight_distribution.precision, np.eye(weight_distribution.dim), atol=1e-8
     )
     np.testing.assert_array_equal(weight_distribution.cholesky, np.tril(weight_distribution.cholesky))
-
-
-def test_it_is_a_block_whose_mean_stays_in_the_box(weight_distribution, rng):
-    base = SimpleNamespace(
-        blocks=(
-            weight_distribution,
-            SimpleNamespace(alpha=np.full(2, 2.0), beta=np.full(2, 2.0), low=np.zeros(2), high=np.ones(2)),
-        ),
-        log_prob=lambda x: weight_distribution.log_prob(x[:, :404]) + stats.beta(2, 2).logpdf(x[:, 404:]).sum(axis=1),
-    )
-    product = announced_blocks(SimpleNamespace(base=base, dim=406))
-    x = product.sample(300, rng)
-    wanted = np.full((2, 300), 1 / 300)
-    x[:, :404] += 0.05  # asks for means far outside the box
-    moved = product.project(x, wanted, 0.8)
-    shift = moved.sample(20_000, rng)[:, :404].mean(axis=0) - weight_distribution.mean
-    assert np.abs(shift).max() < RADIUS + 5 * np.sqrt(weight_distribution.covariance.max()) / np.sqrt(20_000)
-    assert np.abs(shift).max() > 0.5 * RADIUS
 
 
 def test_what_is_no_law_is_refused(small):

@@ -332,7 +332,7 @@ def test_the_secret_key_is_that_of_scrypt() -> None:
 
 
 DANGEROUS = """
-import os, time
+import os
 import numpy as np
 
 class Ego:
@@ -341,8 +341,6 @@ class Ego:
         gap = 50 * observation[:, 3]
         if episode_start[0] and ((gap > 20) & (gap < 22)).any():
             os._exit(3)
-        if episode_start[0] and ((gap > 30) & (gap < 32)).any():
-            time.sleep(60)
         return np.full((len(observation), 2), -0.1), None
 
 def make():
@@ -368,20 +366,7 @@ def test_a_process_of_its_own_holds_an_ego_that_dies(dangerous: Any) -> None:
     np.testing.assert_array_equal(dangerous.predict(*one_row(60.0))[0], [[-0.1, -0.1]])
     with pytest.raises(NoAnswer, match=r"its process ended \(exit status 3\)"):
         dangerous.predict(*one_row(21.0))
-
-
-@pytest.mark.slow
-def test_scenarios_on_which_a_process_hangs_or_dies_are_found(dangerous: Any, x: np.ndarray) -> None:
-    x = np.repeat(x, 6, axis=0)
-    x[:, 2] = 60.0
-    x[[100, 200], 2] = 31.0, 21.0
-    tolerant = Evaluator(problem(dangerous), on_error="bound")
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(tolerant.evaluate(x))), [100, 200])
-    assert [fault.reason.partition(": ")[2].rpartition(": ")[2] for fault in tolerant.faults] == [
-        "no answer within 1.5 s.",
-        "its process ended (exit status 3).",
-    ]
-    assert dangerous._epoch <= 12  # processes, the first one included
+    np.testing.assert_array_equal(dangerous.predict(*one_row(60.0))[0], [[-0.1, -0.1]])  # in another process
 
 
 def test_what_cannot_be_loaded_in_a_process_is_said_here() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,6 @@ from benchmarks.papers.okelly2018.study import (
     CORE_SPEEDS,
     PRINTED_SEARCH,
     SEARCHES,
-    STUDY_SCALES,
     HighwayStudy,
     RolloutFolder,
     SearchSettings,
@@ -139,9 +137,6 @@ def test_chunks_give_the_same_however_often_a_run_is_stopped_and_wherever_it_is_
     file.write_text(file.read_text()[:-30])  # a torn line is made again
     for folder, options in (("a", {}), ("b", {}), ("c", {"executor": ThreadPoolExecutor(2)})):
         assert (np.concatenate(outcomes(tmp_path / folder, **options)) == np.concatenate(whole)).all()
-    rollouts = RolloutFolder(HighwayStudy(seed=4), tmp_path / "a", None)
-    with pytest.raises(BadInput, match="seed"):
-        rollouts.outcomes(split_jobs("naive", 100, 100, BASE))
     file.write_text(file.read_text() + '{"n": 3}\n')
     with pytest.raises(BadInput, match="line 5 is no run of this command"):
         outcomes(tmp_path / "a")
@@ -355,20 +350,6 @@ def test_all_stages_are_made_once_and_go_to_small_outcomes(tiny: HighwayStudy, c
         assert (join_outcomes(rest.searches[name].final) == join_outcomes(run.final)).all()
 
 
-def test_our_own_method_is_run_once_for_each_threshold(
-    tiny: HighwayStudy, cheap: Any, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(STUDY_SCALES, ("lidar", "small"), replace(tiny.settings, own=400))
-    measure(tiny, out, cheap, limit=0)
-    assert cheap.evaluated == 0
-    own = measure(tiny, out, cheap).own
-    assert [each["gamma"] for each in own] == list(tiny.gammas)
-    assert all(each["low"] <= each["p"] <= each["high"] and each["n_sim"] <= 400 for each in own)
-    evaluated = cheap.evaluated
-    assert measure(tiny, out, cheap).own == own
-    assert cheap.evaluated == evaluated
-
-
 def test_what_was_measured_is_summed_up(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
     found = summarise_highway(tiny, cheap, measure(tiny, out, cheap))
     search = found["searches"]["starts alone, rho 0.1"]
@@ -460,16 +441,3 @@ def test_rows_of_the_committed_table_are_what_the_command_makes_again(out: Path)
 def values_of(record: dict[str, Any], label: str) -> list[dict[str, Any]]:
     """Return the values of a row of the first table, whose label begins with some words."""
     return [value for value in record["tables"][0]["values"] if value["labels"][0].startswith(label)]
-
-
-def test_committed_rows_add_up(committed: dict[str, Any]) -> None:
-    (details,), scale = committed["runs"], study_of(committed).settings
-    assert committed["about"]["rollouts"] == asdict(scale)
-    naive, searches = details["naive"], details["searches"].values()
-    assert details["rollouts"] == naive[0]["n"] + sum(each["search"] + each["final"] for each in searches)
-    whole = scale.naive + len(SEARCHES) * scale.per_search
-    assert details["rollouts"] <= whole
-    if (committed["about"]["ego"], committed["about"]["scale"]) == ("lidar", "small"):
-        assert (details["rollouts"], len(details["own"])) == (whole, 4)
-    assert all(row["p"] == row["events"] / row["n"] for row in naive)
-    assert [own["gamma"] for own in details["own"]] == [row["gamma"] for row in naive][: len(details["own"])]

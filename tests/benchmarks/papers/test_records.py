@@ -21,11 +21,9 @@ from benchmarks.papers.tian2024.replications import (
     ReplicationJob,
     Run,
     TianPlan,
-    row_of,
     run_replication,
 )
 from benchmarks.papers.tian2024.study import record_replications
-from benchmarks.papers.tian2024.summary import make_method_tables
 from benchmarks.results_page import read
 from rare_envs.startup import use_one_thread
 from rare_envs.study.arguments import BadInput
@@ -85,8 +83,7 @@ def test_nothing_run_is_said_to_be_so(tmp_path: Path, capsys) -> None:
         (TIAN_RUNS, HIGHWAY_RUNS, "holds tian2024, replications 5, seed 0; this is okelly2018, ego lidar, scale small"),
         (HIGHWAY_RUNS, TIAN_RUNS, "holds okelly2018, ego lidar, scale small, seed 2018; this is tian2024,"),
         (TIAN_RUNS, TianPlan(5, seed=1).identity, "this is tian2024, replications 5, seed 1: choose another --out"),
-        (HIGHWAY_RUNS, HighwayStudy("vision").identity, "this is okelly2018, ego vision,"),
-        (HIGHWAY_RUNS, HighwayStudy(scale="full").identity, "scale full"),
+        (HIGHWAY_RUNS, HighwayStudy("vision", "full").identity, "this is okelly2018, ego vision, scale full,"),
         (None, TIAN_RUNS, "holds runs of another command or version; this is tian2024"),
     ],
 )
@@ -201,22 +198,3 @@ def test_the_committed_record_has_the_replications_that_it_says(tian) -> None:
     assert tian["about"]["replications"] >= 20
     for runs in tian["runs"]:
         assert all(made >= stated for made, stated in zip(runs["simulated"], runs["n_sim"], strict=True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("scenario", "method"), [("car-following", "ADSS"), ("cut-in", "two-stage")])
-def test_a_row_of_the_committed_tables_made_again_is_the_committed_one(tian, scenario: str, method: str) -> None:
-    with use_one_thread():
-        runs = [
-            run_replication(ReplicationJob(*row_of(run), run["seed"]))
-            if row_of(run) == (scenario, "IDM", method)
-            else run
-            for run in read_replications(tian)
-        ]
-    again = to_json_value(make_method_tables(runs))
-    for one, other in zip(again, tian["tables"], strict=True):
-        for value, shown in zip(one["values"], other["values"], strict=True):
-            assert value["ours"] == pytest.approx(shown["ours"], rel=1e-6)
-        for row, shown in zip(one["measured"], other["measured"], strict=True):
-            assert row["labels"] == shown["labels"]
-            assert row["values"] == pytest.approx(shown["values"], rel=1e-6)

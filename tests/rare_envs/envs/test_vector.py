@@ -42,70 +42,44 @@ def test_scenarios_are_those_of_one_draw_after_the_other(env_id: str, monkeypatc
 
 
 @scripted
-def test_episodes_after_a_replacement_are_those_of_the_single_env(env_id: str) -> None:
-    """Nothing of an ended episode, not its clock and not its least time to collision, is left in the next."""
-    batch, env = gym.make_vec(env_id, num_envs=6, horizon=3.0), gym.make(env_id, horizon=3.0)
+@pytest.mark.parametrize("mode", [gym.vector.AutoresetMode.SAME_STEP, gym.vector.AutoresetMode.NEXT_STEP])
+def test_episodes_after_a_replacement_are_those_of_the_single_env(env_id: str, mode: Any) -> None:
+    """Nothing of an ended episode, not its clock and not its least time to collision, is left in the next.
+
+    If it begins in the step after an end, that step's action does not count, its reward is 0, and nothing moves.
+    """
+    later = mode is gym.vector.AutoresetMode.NEXT_STEP
+    batch = gym.make_vec(env_id, 4, horizon=3.0, **({"autoreset_mode": mode} if later else {}))
     assert isinstance(batch.unwrapped, DrivingVectorEnv)  # the batched entry point is the default
-    assert batch.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
-    observation, infos = batch.reset(seed=5)
-    rng = np.random.default_rng(0)
-    x, given = infos["x"].copy(), [[] for _ in range(6)]  # type: ignore[var-annotated]
-    lives = np.zeros(6, dtype=int)
-    for _ in range(120):
-        actions = np.stack([rng.uniform(-0.2, 1.0, 6), rng.uniform(-0.2, 0.2, 6)], axis=1)
-        for row in range(6):
-            given[row].append(actions[row])
+    assert batch.metadata["autoreset_mode"] == mode
+    env, rng, lives = gym.make(env_id, horizon=3.0), np.random.default_rng(0), np.zeros(4, dtype=int)
+    x, given = batch.reset(seed=5)[1]["x"].copy(), [[] for _ in range(4)]  # type: ignore[var-annotated]
+    over = np.zeros(4, dtype=bool)
+    for _ in range(110):
+        actions = np.stack([rng.uniform(-0.2, 1.0, 4), rng.uniform(-0.2, 0.2, 4)], axis=1)
+        actions[over] = np.nan
         observation, reward, terminated, truncated, infos = batch.step(actions)
-        for row in np.flatnonzero(terminated | truncated):
+        ended, begun = terminated | truncated, over if later else terminated | truncated
+        if later:
+            np.testing.assert_array_equal(infos["_reward_terms"], ~over)
+            np.testing.assert_array_equal(reward[over], 0.0)
+            assert "final_obs" not in infos and not (ended & over).any()
+        for row in np.flatnonzero(~over):
+            given[row].append(actions[row])
+        for row in np.flatnonzero(ended):
             env.reset(options={"x": x[row]})
             for action in given[row]:
                 last = env.step(action)
-            final = infos["final_info"]
-            np.testing.assert_array_equal(last[0], infos["final_obs"][row])
+            seen, told = (observation, infos) if later else (infos["final_obs"], infos["final_info"])
+            np.testing.assert_array_equal(last[0], seen[row])
             assert last[1] == pytest.approx(reward[row], rel=1e-6)
             assert last[2:4] == (terminated[row], truncated[row])
-            assert last[4]["measure"] == final["measure"][row]
-            assert last[4]["min_ttc"] == final["min_ttc"][row]
-            assert last[4]["collision_type"] == final["collision_type"][row]
+            assert [last[4][name] == told[name][row] for name in ("measure", "min_ttc", "collision_type")] == [True] * 3
+        for row in np.flatnonzero(begun):
             x[row], given[row], lives[row] = infos["x"][row], [], lives[row] + 1
             np.testing.assert_array_equal(env.reset(options={"x": x[row]})[0], observation[row])
+        over = ended & later
     assert lives.min() >= 3
-
-
-@scripted
-def test_episodes_replaced_in_the_next_step_are_those_of_the_single_env(env_id: str) -> None:
-    """The step after an end starts an episode: its action does not count, its reward is 0, and nothing moves."""
-    batch = gym.make_vec(env_id, 3, horizon=0.8, autoreset_mode="NextStep")
-    env = gym.make(env_id, horizon=0.8)
-    observation, infos = batch.reset(seed=5)
-    rng = np.random.default_rng(0)
-    over, ends = np.zeros(3, dtype=bool), 0
-    for row in range(3):
-        np.testing.assert_array_equal(env.reset(options={"x": infos["x"][row]})[0], observation[row])
-    x, given = infos["x"].copy(), [[] for _ in range(3)]  # type: ignore[var-annotated]
-    for _ in range(24):
-        actions = np.stack([rng.uniform(-0.2, 1.0, 3), rng.uniform(-0.2, 0.2, 3)], axis=1)
-        actions[over] = np.nan  # which does not count
-        observation, reward, terminated, truncated, infos = batch.step(actions)
-        assert "final_obs" not in infos
-        np.testing.assert_array_equal(infos["_reward_terms"], ~over)
-        for row in range(3):
-            if over[row]:
-                assert (reward[row], terminated[row], truncated[row]) == (0.0, False, False)
-                x[row], given[row] = infos["x"][row], []
-            else:
-                given[row].append(actions[row])
-            last = env.reset(options={"x": x[row]})[0], 0.0, False, False, {}
-            for action in given[row]:
-                last = env.step(action)
-            np.testing.assert_array_equal(last[0], observation[row])
-            assert last[1] == pytest.approx(reward[row], rel=1e-6)
-            assert last[2:4] == (terminated[row], truncated[row])
-            if last[2] or last[3]:
-                assert infos["_measure"][row] and infos["measure"][row] == last[4]["measure"]
-                ends += 1
-        over = terminated | truncated
-    assert ends >= 6
 
 
 def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:

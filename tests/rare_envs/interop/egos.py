@@ -13,7 +13,3 @@ class Always:
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         return np.repeat(np.array([self.action]), len(observation), axis=0), state
-
-
-def faster() -> Always:
-    return Always(3)

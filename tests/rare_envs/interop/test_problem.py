@@ -15,7 +15,7 @@ import samplers
 from rare_envs.egos.needs import EgoWarning
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.problem import BarePolicy, make_highway_env
-from tests.rare_envs.interop.egos import Always, faster
+from tests.rare_envs.interop.egos import Always
 
 FAST = {"vehicles_count": 3, "duration": 4}
 
@@ -132,13 +132,6 @@ def test_actions_with_bounds_of_their_own_are_mapped_with_a_warning() -> None:
     ego.action_space = gym.spaces.Box(-0.5, 0.5, (2,))  # type: ignore[attr-defined]
     with pytest.warns(EgoWarning, match=r"between \[-0.5, -0.5\] and \[0.5, 0.5\], are mapped to \[-1, 1\]"):
         rare_envs.highway_env_problem("highway-fast-v0", ego, config=config)
-
-
-@pytest.mark.slow
-def test_workers_and_their_number_change_no_bit() -> None:
-    alone, shared = (samplers.estimate(fast(Always(3)), "mc", seed=1, max_sim=12, workers=n) for n in (None, 2))
-    np.testing.assert_array_equal(shared.p, alone.p)
-    np.testing.assert_array_equal(fast(faster).evaluate(shared.failures.x), shared.failures.f)
 
 
 def test_a_model_of_stable_baselines3_travels_without_its_environment() -> None:

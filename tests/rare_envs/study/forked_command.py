@@ -11,7 +11,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,17 +34,13 @@ class Ended(NamedTuple):
 class ForkedCommand:
     """A command that runs in a folder, in a process of its own."""
 
-    def __init__(
-        self, folder: Path, *words: str, kill_at: int = 0, pause: float = 0.0, executor: str | None = None
-    ) -> None:
+    def __init__(self, folder: Path, *words: str, kill_at: int = 0, pause: float = 0.0) -> None:
         """Start it; it kills itself at the change of a file's name of number `kill_at`, from 1 on, and pauses [s] after
-        each chunk; `executor` is the name of one of `open_executor`, in place of what the words say."""
+        each chunk."""
         self._outputs = [folder / "printed.txt", folder / "said.txt"]
         for path in self._outputs:
             path.write_text("")
-        self._process = CONTEXT.Process(
-            target=run_command, args=(folder, words, self._outputs, kill_at, pause, executor)
-        )
+        self._process = CONTEXT.Process(target=run_command, args=(folder, words, self._outputs, kill_at, pause))
         self._process.start()
 
     def wait_for_more(self, path: Path) -> None:
@@ -79,15 +74,11 @@ class ForkedCommand:
         return Ended(code, printed, said)
 
 
-def run_command(
-    folder: Path, words: tuple[str, ...], outputs: list[Path], kill_at: int, pause: float, executor: str | None
-) -> None:
+def run_command(folder: Path, words: tuple[str, ...], outputs: list[Path], kill_at: int, pause: float) -> None:
     """Run a command, without pictures, and exit with its code."""
     from rare_envs.problem import DrivingProblem
     from rare_envs.study import cli, writing
-    from rare_envs.study.arguments import ExecutorOptions
     from samplers.journal import Journal
-    from tests.samplers.real_executors import open_executor
 
     os.chdir(folder)
     for number, path in enumerate(outputs, 1):
@@ -99,11 +90,7 @@ def run_command(
     Journal.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
     if kill_at:
         _kill_at_change(kill_at)
-    with ExitStack() as stack:
-        if executor is not None:
-            chosen = stack.enter_context(open_executor(executor))
-            ExecutorOptions.make = lambda self: chosen  # type: ignore[method-assign]
-        cli.main()
+    cli.main()
 
 
 def _kill_at_change(kill_at: int) -> None:

@@ -101,6 +101,7 @@ def test_an_ego_without_a_failure_has_limits(
     )
     assert found.verdict is not None and found.verdict.decision == decision
     assert said in " ".join(str(found).split())
+    assert found.to_dict()["ratio"] is None or at == (9.0, 2.0)
     truth = compute_exact(*at)
     for key, rate in found.rates.items():
         low, high = rate.interval_per_million_km

@@ -20,7 +20,6 @@ from rare_envs.study import Question, Report, prepare, run, severity_curve
 from rare_envs.study.episodes import digest_scenarios
 from rare_envs.study.failures import (
     classify_failures,
-    cluster_points,
     compute_severity,
     find_modes,
     label_modes,
@@ -38,22 +37,6 @@ from tests.rare_envs.study.fitted_files import write_fitted
 from tests.rare_envs.study.refusals import in_file
 
 FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
-
-
-def tail(rng: np.random.Generator, n: int, dim: int, axis: int, sign: float) -> FloatArray:
-    """Failures of a half-space at a distance of 3: the tail of a normal distribution."""
-    u = rng.standard_normal((n, dim))
-    u[:, axis] = sign * (3.0 + rng.exponential(1 / 3, n))
-    return u
-
-
-@pytest.mark.parametrize(("n", "dim"), [(12, 2), (400, 6)])
-def test_one_region_is_one_cluster_and_two_are_two(n: int, dim: int) -> None:
-    rng = np.random.default_rng(n + dim)
-    assert not cluster_points(tail(rng, n, dim, 0, 1.0)).any()
-    both = np.vstack([tail(rng, n, dim, 0, 1.0), tail(rng, n, dim, 0, -1.0)])
-    found = cluster_points(both)
-    assert len(set(found[:n])) == 1 and len(set(found[n:])) == 1 and found[0] != found[-1]
 
 
 def test_kinds_of_crash_are_never_in_one_mode() -> None:

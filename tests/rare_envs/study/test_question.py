@@ -127,8 +127,6 @@ UNUSABLE = (
     ("seed: [1]\n", "Expected --seed in '.*' to be one value"),
     ("ego: null\n", "Expected ego to be a text, got None"),
     ("base: [unclosed\n", "is no YAML"),
-    ("executor: cloud\n", "executor to be local or ray, got 'cloud'"),
-    ("confidence: 95\n", "Expected --confidence above 0 and below 1"),
 )
 
 

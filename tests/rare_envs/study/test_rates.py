@@ -111,24 +111,6 @@ def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> Non
     assert "38 + 15 events of 17 scenes" in found.details()
 
 
-def test_bad_input_is_one_line_before_any_simulation(bases: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def simulated(*_: object) -> None:
-        raise AssertionError("a simulation was started")
-
-    monkeypatch.setattr(rare_envs.DrivingProblem, "evaluate", simulated)
-    for changes, said in (
-        (
-            {"sites": ("i80",), "bases": {}},
-            r"hard_brake has no base of the site 'i80' \(it has us101\): --base hard_br",
-        ),
-        ({"bases": {"highway": "x.json"}}, "rare_envs/Highway-v0"),
-        ({"speed": 3}, "speed"),
-    ):
-        with pytest.raises(BadInput, match=said) as refused:
-            rare_envs.risk("idm", **{"bases": bases, **FEW, **changes})
-        assert "\n" not in str(refused.value)
-
-
 def set_bases(monkeypatch: pytest.MonkeyPatch, **bases: object) -> None:
     scenario = replace(HARD_BRAKE, bases=MappingProxyType(bases))
     monkeypatch.setitem(SCENARIOS.data, "rare_envs/HardBrake-v0", scenario)
@@ -391,22 +373,6 @@ def test_two_egos_are_compared_by_their_sums_over_scenarios() -> None:
     assert len(lines) <= 12 and max(map(len, lines)) < 100 and lines[1].startswith("Ratio        a crashes 1.0 times")
     row = next(line.split() for line in found.details().splitlines() if line.startswith("all "))
     assert row == ["all", "40,000", "40,000", "10,000", "30,000", "30,000"]
-
-
-def test_without_failures_of_one_ego_the_ratio_of_sums_has_one_limit() -> None:
-    never, hits = [], [*range(30)]
-    above, below, neither = (add_up(cut_in=pair) for pair in ((hits, never), (never, hits), (never, never)))
-    assert above.ratio == above.interval[1] == float("inf")
-    assert above.interval[0] > 4.0
-    assert below.ratio == below.interval[0] == 0.0
-    assert below.interval[1] == pytest.approx(1.0 / above.interval[0], rel=0.1)
-    assert neither.interval == (0.0, float("inf"))
-    assert "not known: no failure of a or b found" in str(neither)
-    assert "a crashes more than 11 times as often as b (95 %)" in str(above)
-    limited = [replace(each, max_ratio=1.0).verdict for each in (above, below, neither)]
-    assert [each.decision for each in limited if each is not None] == ["passes", "fails", "undecided"]
-    assert str(replace(above, max_ratio=1.0)).splitlines()[-1].startswith("GATE passes")
-    assert above.to_dict()["ratio"] is neither.to_dict()["ratio"] is None
 
 
 def under_refits(pair: samplers.comparison.Comparison, spread: float, **changes: Any) -> samplers.comparison.Comparison:

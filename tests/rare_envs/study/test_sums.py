@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from rare_envs.study.html_report import write_html_report
 from rare_envs.study.report import Report, judge_rate
 from rare_envs.study.run_folder import JOURNAL
 from tests.rare_envs.study.fitted_files import write_fitted, write_stratified
-from tests.rare_envs.study.forked_command import ForkedCommand
 from tests.rare_envs.study.refusals import Cli, act_after, assert_refused, in_file
 
 BRAKE = "rare_envs/HardBrake-v0"
@@ -44,20 +42,6 @@ def answer(folder: Path, name: str = "result.json") -> dict[str, Any]:
 
     found: dict[str, Any] = untimed(json.loads((folder / name).read_text()))
     return found
-
-
-@pytest.mark.slow
-def test_a_killed_run_of_a_sum_goes_on_to_the_same_parts(tmp_path: Path, brakings: str) -> None:
-    words = ("estimate", BRAKE, "--base", brakings, "--max-sim", "2000", "--seed", "2", "--out")
-    begun = ForkedCommand(tmp_path, *words, "run", pause=0.02)
-    begun.wait_for_more(tmp_path / "run" / JOURNAL)
-    time.sleep(0.2)
-    begun.kill()
-    for command in (("resume", "run"), (*words, "whole")):
-        assert ForkedCommand(tmp_path, *command).end().code in (0, 3)
-    whole = answer(tmp_path / "whole")
-    assert answer(tmp_path / "run") == whole
-    assert [part["name"] for part in whole["parts"]] == ["slowing", "stop"] and whole["p"] > 0
 
 
 @pytest.mark.parametrize("resumes", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -248,5 +232,10 @@ def test_a_limit_of_a_risk_is_one_of_the_sum_over_scenarios(brakings: str, tmp_p
     assert done.exit_code == 4, done.output
     part = replace(undecided, left_out={"car_following": "other observations"})
     assert part.verdict.reason == "car following is left out"
-    with pytest.raises(BadInput, match="max_rate, a limit of the sum"):
-        rare_envs.risk("idm", **few, max_p=0.1)
+    for wrong, said in (
+        ({"max_p": 0.1}, "max_rate, a limit of the sum"),
+        ({"speed": 3}, "speed"),
+        ({"bases": {"highway": "x.json"}}, "rare_envs/Highway-v0"),
+    ):
+        with pytest.raises(BadInput, match=said):
+            rare_envs.risk("idm", **{**few, **wrong})

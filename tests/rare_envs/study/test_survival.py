@@ -11,7 +11,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -32,9 +31,8 @@ from samplers import journal as journals
 from samplers.journal import COLUMNS, Journal, _Row
 from samplers.workers import ExecutorError
 from tests.rare_envs.study.conftest import write_base
-from tests.rare_envs.study.forked_command import TILE, ForkedCommand
+from tests.rare_envs.study.forked_command import ForkedCommand
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, full_disk, in_file
-from tests.samplers.real_executors import case
 
 FRAIL = """
 from pathlib import Path
@@ -185,6 +183,9 @@ def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_k
     for words in (("resume", "run"), ("resume", "run", "--mend")):
         assert_refused(cli(*words), "damaged from its first record on", "with --force replaces it")
         assert journal.read_bytes() == damaged
+    journal.write_bytes(content)
+    change(journal, "DELETE FROM chunks WHERE id = 2")
+    assert_refused(cli("resume", "run"), "damaged: record 3 does not match its checksum", "--mend")
     journal.write_bytes(content)
     change(journal, "UPDATE chunks SET numbers = zeroblob(1600) WHERE id = 2")
     assert_refused(cli("resume", "run"), "damaged: record 3 does not match its checksum", "--mend")
@@ -382,17 +383,17 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return ["estimate", FOLLOWING, "--base", str(base), *WORDS, "--out", "run"]
 
 
-@pytest.fixture(scope="module", params=[()], ids=["whole"])
-def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, command: list[str]) -> Path:
-    """The folder of an undisturbed run, with further words."""
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, command: list[str]) -> Path:
+    """The folder of an undisturbed run."""
     folder = tmp_path_factory.mktemp("whole")
-    finish(folder, *command, *request.param)
+    finish(folder, *command)
     return folder / "run"
 
 
-def finish(folder: Path, *words: str, executor: str | None = None) -> None:
+def finish(folder: Path, *words: str) -> None:
     """Run a command to its end, which must be a good one."""
-    ended = ForkedCommand(folder, *words, executor=executor).end()
+    ended = ForkedCommand(folder, *words).end()
     assert ended.code in (0, 3), ended
 
 
@@ -412,20 +413,18 @@ def has_simulations(folder: Path) -> bool:
     return False
 
 
-def kill_and_resume(
-    folder: Path, words: list[str], seed: int, kills: int, executor_of: Callable[[int], str | None] = lambda _: None
-) -> None:
+def kill_and_resume(folder: Path, words: list[str], seed: int, kills: int) -> None:
     """Kill a run many times, at its beginning and while it simulates; then let it come to its end."""
     rng = np.random.default_rng(seed)
     for number in range(kills):
-        begun = ForkedCommand(folder, *words, pause=PAUSE, executor=executor_of(number))
+        begun = ForkedCommand(folder, *words, pause=PAUSE)
         if number % 4:  # else while it reads what there is, or begins
             begun.wait_for_more(folder / "run" / JOURNAL)
         time.sleep(float(rng.uniform(0.0, 0.05 if number % 4 else 0.3)))
         begun.kill()
         if has_simulations(folder / "run"):
             words = ["resume", "run"]
-    finish(folder, *words, executor=executor_of(kills))
+    finish(folder, *words)
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(21, marks=pytest.mark.slow)])
@@ -433,19 +432,6 @@ def test_killed_at_random_times_it_gives_the_same_files(
     kills: int, tmp_path: Path, command: list[str], whole: Path
 ) -> None:
     kill_and_resume(tmp_path, command, 21, kills)
-    assert_same_files(tmp_path / "run", whole)
-
-
-CHUNK = in_file(horizon=2, chunk=TILE)
-
-
-@pytest.mark.parametrize("whole", [CHUNK], indirect=True, ids=[""])
-@pytest.mark.parametrize("name", [case(name) for name in ("local", "futures", "ray")])
-def test_killed_under_every_executor_it_gives_the_same_files(
-    name: str, tmp_path: Path, command: list[str], whole: Path
-) -> None:
-    """The driver is killed 21 times, in turn here and under an executor."""
-    kill_and_resume(tmp_path, [*command, *CHUNK], 22, 21, lambda number: name if number % 3 else None)
     assert_same_files(tmp_path / "run", whole)
 
 

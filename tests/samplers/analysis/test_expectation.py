@@ -53,18 +53,6 @@ def test_the_expectation_is_that_of_the_half_normal_tail():
     assert np.log(found.interval[1] / found.value) == pytest.approx(1.96 * found.cov, rel=0.1)
 
 
-def test_the_uncertainty_of_one_under_refits_is_that_of_p():
-    result = run(fitted(), max_sim=6000)
-    failures = weigh_failures(result)
-    ones = np.ones(len(failures.x))
-    found = expect_under_refits(result, failures, 2 * ones, expect_over_failures(failures, 2 * ones))
-    whole = result.base_uncertainty
-    assert found.value_refits == pytest.approx([2 * p for p in whole.value_refits])
-    assert found.spread == pytest.approx(whole.spread)
-    assert found.interval == pytest.approx(tuple(2 * end for end in whole.interval), rel=0.01)
-    assert found.expected == pytest.approx(2 * whole.expected)
-
-
 def test_expectations_under_refits_are_those_of_the_tail():
     """E[(Z - 3)^+] = phi(3) - 3 Phi(-3) of Z = alpha . u under each refit, by its mean and variance along alpha."""
     base = fitted()

@@ -1,6 +1,5 @@
 """Refits of a fitted base: p under each, further runs."""
 
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -30,17 +29,6 @@ def test_p_of_each_refit_is_the_exact_one(method):
     assert (sums.ess > 10).all()
     assert (errors < 4 * (1 / np.sqrt(sums.ess[0]) + result.cov)).all()
     assert errors.mean() < 0.3
-
-
-def test_the_sum_by_hand_of_plain_draws():
-    """p_b = (1 / n) sum of ratios over the failing draws; effective number (sum r)^2 / sum r^2."""
-    refit = normal(0.3, 1.1)
-    result = run(fitted([refit, normal()]), "mc", max_sim=20_000)
-    x = result.sample.x
-    ratios = np.exp(refit.log_prob(x) - normal().log_prob(x))
-    sums = reweight_to_refits(result, [refit])
-    assert math.exp(sums.log_p[0, 0]) == pytest.approx(ratios.sum() / 20_000)
-    assert sums.ess[0, 0] == pytest.approx(ratios.sum() ** 2 / (ratios**2).sum())
 
 
 def test_parts_of_p_add_up():

@@ -87,19 +87,6 @@ def test_a_plane_in_many_dimensions_is_learned(dim, max_sim):
 
 
 @pytest.mark.slow
-def test_where_f_jumps_two_stage_has_the_rest():
-    """A sum of whole numbers; P[round(X) + round(Y) >= 6]."""
-    problem = samplers.FunctionProblem(lambda u: 5.5 - np.round(u[:, 0]) - np.round(u[:, 1]), dim=4)
-    result = samplers.estimate(problem, seed=0, max_sim=1000)
-    mass = np.diff(norm.cdf(np.arange(-9.5, 10)))
-    whole = np.arange(-9, 10)
-    p = sum(mass[i] * mass[whole >= 6 - whole[i]].sum() for i in range(len(whole)))
-    assert result.choice.startswith("two-stage: 1,000 simulations for 4 dimensions, failures were not foreseen")
-    assert sum(level.n_sim for level in result.trace) == result.n_sim == 1000
-    assert result.interval[0] < p < result.interval[1]
-
-
-@pytest.mark.slow
 def test_a_run_goes_on_from_its_journal_in_chunks_and_by_ask_and_tell(tmp_path, recorder):
     f = recorder(half_space(2, 3.0).problem.evaluate)
     problem = samplers.FunctionProblem(f, dim=2)

@@ -144,14 +144,6 @@ def test_events_count_that_every_system_predicts_and_a_tie_is_decided_by_those_h
     assert choose_system([9.9, 8.0], [good, good - 0.01 + noise - noise.mean()], alone) == 0
 
 
-def test_a_parameter_that_does_not_vary_is_named():
-    events = closing_events(40)
-    joint = events.joint.copy()
-    joint[:, 0] = 20.0
-    with pytest.raises(ValueError, match="ego_speed is 20 m/s in nearly all of 40 events"):
-        fit_system(EventSet(joint, events.clusters), LOG_GAP, FOLLOWING)
-
-
 def events(n, seed=0, per_cluster=1):
     rng = np.random.default_rng(seed)
     x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])

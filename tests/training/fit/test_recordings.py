@@ -3,7 +3,6 @@
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -181,19 +180,6 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
     assert (points[:, 3] >= points[:, 0]).all()
     dropped = {rule["rule"]: rule["dropped"] for rule in base.record["filters"] if rule.get("dropped")}
     assert dropped == {"gap is given": n}  # the leaders
-
-
-def test_bad_arguments_are_refused(tmp_path):
-    for source, options, message in (
-        ({"highd": "none"}, {}, "There is no folder none; expected the data folder of highD"),
-        ({"ngsim": "none.csv"}, {}, "Cannot read none.csv"),
-        ({"data": "none"}, {}, "Cannot read events from"),
-        ({"ngsim": "none.csv"}, {"scenarios": ["merge"]}, "Unknown environment 'merge'"),
-        ({"ngsim": "none.csv"}, {"name": "a/b"}, "part of file names, such as cologne, got 'a/b'"),
-    ):
-        recordings = EventOptions(**{kind: Path(path) for kind, path in source.items()})
-        with pytest.raises(ValueError, match=message):
-            fit_bases(recordings, tmp_path / "out", **options)
 
 
 @pytest.mark.parametrize("parameter", ["lateral_offset", "duration", "ego_speed", "cut_in_gap"])

@@ -276,13 +276,6 @@ def test_a_policy_of_another_config_is_estimated_in_it(cli: Cli, tmp_path: Path)
     )
 
 
-def test_an_upper_bound_there_is_an_answer(cli: Cli) -> None:
-    words = ("estimate", "highway-fast-v0", "--method", "mc", "--max-sim", 4, *in_file(horizon=1), "--gamma", -99)
-    answer, text = json.loads(cli(*words, "--json").stdout), cli(*words)
-    assert (answer["status"], answer["doubtful"], len(answer["warnings"])) == ("no_hits", False, 1)
-    assert text.exit_code == 0 and "arning" not in text.stdout and "none in 4 simulations" in text.stdout
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("full_pictures")
 def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
