@@ -263,7 +263,7 @@ def load_study(folder: str | Path) -> LoadedStudy:
 
     Returns:
         Its numbers; failures and simulations are read when they are asked for. Files that are not what the run wrote
-        come with a warning, and their names are its `changed_files`.
+        come with a warning, and their names are its `changed_files`; so do files without digests.
 
     Raises:
         BadInput: There is no finished run, or a file of it is damaged.
@@ -301,10 +301,14 @@ def load_study(folder: str | Path) -> LoadedStudy:
     with as_bad_input(OSError):
         changed = study.changed_files
     if changed:
-        warnings.warn(
-            f"Not what the run in {str(folder)!r} wrote, by the digests in its {STUDY}: {', '.join(changed)}.",
-            stacklevel=2,
+        doubt = f"Not what the run in {str(folder)!r} wrote, by the digests in its {STUDY}: {', '.join(changed)}."
+    elif not isinstance(about.get("results"), dict):
+        doubt = (
+            f"Nothing tells whether the files in {str(folder)!r} are what a run wrote: no {STUDY} with their digests."
         )
+    else:
+        return study
+    warnings.warn(doubt, stacklevel=2)
     return study
 
 

@@ -16,6 +16,7 @@ import pytest
 
 import agents
 import rare_envs
+from rare_envs.files import digest_file
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import BadInput, Question, prepare, run_into
 from rare_envs.study.arguments import RunInterrupted, read_question
@@ -101,7 +102,7 @@ def change_question(folder: Path, **changes: Any) -> dict[str, Any]:
     result["question"] = {**result["question"], **changes}
     (folder / RESULT).write_text(json.dumps(result))
     about = json.loads((folder / STUDY).read_text())
-    about.pop("results", None)  # digests, which a sender would write anew
+    about["results"][RESULT] = digest_file(folder / RESULT)  # as a sender would write it anew
     (folder / STUDY).write_text(json.dumps(about))
     return dict(result["question"])
 
@@ -176,8 +177,9 @@ def test_the_method_of_a_received_run_is_not_imported_for_a_plan(received: Path,
     change_question(received, method="evil:Coasting")
     assert_refused(cli("estimate", received, "--plan"), "runs code: 'evil:Coasting'", "add --trust")
     result = json.loads((received / RESULT).read_text())
-    result["method"]["name"], result["question"]["method"] = "evil:Coasting", "mc"
+    result["method"]["name"] = "evil:Coasting"
     (received / RESULT).write_text(json.dumps(result))
+    change_question(received, method="mc")
     assert cli("estimate", received, "--plan").exit_code == 0
     assert not Path("was_here").exists()
 
