@@ -24,7 +24,7 @@ from agents.sb3_archive import build_policy, check_space, find_algorithm, read_a
 from rare_envs.egos.wrappers import STATS_ADVICE, UNBOUNDED, WrappedPolicy, find_stacking
 from rare_envs.files import read_bytes
 from rare_envs.plugins import one_line
-from rare_envs.simulation.observation import observation_space
+from rare_envs.simulation.observation import BEHIND, VIEW, observation_space
 from rare_envs.startup import advise_install
 
 HUB_PREFIX = "hf:"
@@ -40,6 +40,8 @@ LAST, ORIGINAL = "_last_obs", "_last_original_obs"
 """Entries of a `.zip`: the last observations of its training, and such from before `VecNormalize`."""
 _BEYOND = 1e-3
 """Observations beyond the bounds by less are rounding."""
+_APART = 0.01
+"""Differences of distances along the road, 2 m of 200, that a bend does not make."""
 _STEP = 0.5
 """A change of the observations of ordinary environments in one step is smaller; `VecNormalize` moves some by more."""
 _FASTEST = 0.6
@@ -268,12 +270,15 @@ def describe_other_kinematics(seen: NDArray[Any]) -> str:
     """Return which setting of HighwayEnv's Kinematics is not its default in observations (B, 5, 5); "" if none is."""
     ego, others = seen[:, 0], seen[:, 1:][seen[:, 1:, 0] > 0]
     if np.abs(seen).max() > 1.0 + _BEYOND:
-        return "not normalised (normalize)"
+        return "not normalised (normalize)" if np.abs(ego[:, 3:]).max() > 1.0 + _BEYOND else "not clipped (clip)"
     if not np.isin(seen[..., 0], (0, 1)).all() or ego[:, 3].max() > _FASTEST:
         return "of other features than presence, x, y, vx, vy (features)"
     if len(others) and others[:, 3].min() > ego[:, 3].max() / 2 > 0:  # relative speeds that are as large are not found
         return "not relative to the ego (absolute)"
-    return ""
+    if len(others) and others[:, 1].min() < -BEHIND / VIEW - _APART:
+        return "of vehicles behind the ego too (see_behind)"
+    far = np.where(seen[:, 1:, 0] > 0, np.abs(seen[:, 1:, 1]), np.inf)
+    return "not sorted by distance (order)" if (far[:, 1:] < far[:, :-1] - _APART).any() else ""
 
 
 def _has_original_observations(header: Mapping[str, Any], last: Any) -> bool:

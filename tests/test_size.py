@@ -11,8 +11,8 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_900,
-    "code lines": 36_820,
+    "package lines": 57_850,
+    "code lines": 36_780,
     "modules": 214,
     "functions": 3_230,
     "classes": 472,

@@ -262,8 +262,8 @@ def choose_action(action_space: Any, observation: str) -> str:
     if takes_indices(action_space):
         raise ValueError(
             "The ego's actions 0 to 4 fit two kinds: HighwayEnv's meta-actions (action='meta', --action meta; or the "
-            "environment's id with -kinematics) and five accelerations (action='discrete', --action discrete); say "
-            "which."
+            "environment's id with -kinematics), of target speeds 20, 25 and 30 m/s (no file tells; others by "
+            "env_config in HighwayEnv's ids), and five accelerations (action='discrete', --action discrete); say which."
         )
     return "continuous"
 

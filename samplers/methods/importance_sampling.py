@@ -41,7 +41,7 @@ class ImportanceSampling(Method):
     origin as the tilt sees it, or more than 5 % of the failing ones found lie where the tilted density is
     under the base density, the tilt is given up for base draws, with a warning: other regions would
     otherwise carry weights of 1 / base_share at best, or not be seen before the stop. Tian et al. blame
-    the method's error of 11 to 17 % on such regions. A region without a sign in the first round stays unseen.
+    the method's error of 11 to 17 % on such regions. A region without a sign in the first round is missed.
     The same holds for a tilt that is mostly noise (some hundred dimensions).
 
     Args:

@@ -146,11 +146,24 @@ def test_a_function_takes_whatever_file_its_settings_name(file: str, how: str, s
 FEATURES = ["presence", "x", "y", "cos_h", "sin_h"]
 
 
-@pytest.mark.parametrize("setting", [{}, {"absolute": True}, {"normalize": False}, {"features": FEATURES}])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        *[{}, {"absolute": True}, {"normalize": False}, {"features": FEATURES}],
+        *[{"clip": False}, {"see_behind": True}, {"order": "shuffled"}],
+    ],
+)
 def test_other_kinematics_are_told_by_the_last_observations(setting: dict[str, Any], seen: Any) -> None:
     env = gym.make("highway-fast-v0", config={"observation": {"type": "Kinematics", **setting}})
     model = DQN("MlpPolicy", env, buffer_size=10, device="cpu")
-    model._last_obs = env.reset(seed=0)[0][None]  # which training leaves there
+    last = env.reset(seed=0)[0]
+    if "clip" in setting:
+        last[0, 1] = 1.4  # 280 m along the road
+    if "see_behind" in setting:
+        last[4, 1] = -0.2  # 40 m behind
+    if "order" in setting:
+        last[1:] = last[:0:-1].copy()
+    model._last_obs = last[None]  # which training leaves there
     model.save("ego:a?b=c.zip")  # no function
     here = gym.make("rare_envs/CutIn-kinematics-v0").observation_space
     ego = load_ego("ego:a?b=c.zip")

@@ -110,6 +110,22 @@ def test_an_ego_without_a_failure_has_limits(
     assert ("cc_human crashes 15,000 times as often as people" in str(found)) == (at[0] == 2.0)
 
 
+@pytest.mark.parametrize(("crashes", "near", "said"), [(1.5, 2.0, True), (2.0, 1.5, False)])
+def test_near_crashes_below_the_crashes_that_they_include_are_pointed_out(
+    crashes: float, near: float, said: bool
+) -> None:
+    made_up = EventFrequency(count=1000, hours=10.0, km=4000.0, definition="events", source="made up")
+    whole, of_near = (
+        RateComparison(
+            scenarios={"cut_in": samplers.compare(*half_spaces(at, at), "mc", seed=0, max_sim=2000)},
+            frequencies={"cut_in": made_up},
+        )
+        for at in (crashes, near)
+    )
+    found = RiskComparison(ego_a="idm", ego_b="rss", outcomes={"near_crashes": of_near}, **vars(whole))
+    assert ("Careful      found + near-crashes below crashes, which they include" in str(found)) == said
+
+
 def test_few_simulations_bound_all_and_fewer_are_refused() -> None:
     with pytest.raises(BadInput, match="at least 8, got 7"):
         compare_risks("idm", "rss", max_sim=7)
