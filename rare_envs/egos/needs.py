@@ -270,7 +270,8 @@ def choose_action(action_space: Any, observation: str) -> str:
 
 def takes_indices(action_space: Any) -> bool:
     """Return whether actions are numbers from 0 to 4, which meta-actions are and accelerations by index too."""
-    return isinstance(action_space, spaces.Discrete) and int(action_space.n) == len(DISCRETE_ACTIONS)
+    known = isinstance(action_space, spaces.Discrete) and int(action_space.n) == len(DISCRETE_ACTIONS)
+    return known and int(action_space.start) == 0
 
 
 AMBIGUOUS = (

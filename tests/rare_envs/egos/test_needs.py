@@ -91,6 +91,12 @@ def test_several_or_none_are_refused_in_a_line() -> None:
         assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("space", [spaces.Discrete(7), spaces.Discrete(5, start=1)])
+def test_other_numbers_than_0_to_4_are_refused(space: spaces.Discrete) -> None:
+    with pytest.raises(ValueError, match=r"^The ego acts in Discrete\(.*or Discrete\(5\); put an object"):
+        rare_envs.DrivingProblem(CUT_IN, ego=idle(observation_space(3), space))
+
+
 @pytest.mark.parametrize("shape", [(64, 80, 3), (12, 64, 80)])
 @pytest.mark.parametrize("named", [False, True])
 def test_pictures_of_another_size_are_refused_by_both_sizes_and_a_camera_gives_them(
