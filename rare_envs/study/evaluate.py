@@ -36,9 +36,9 @@ from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.world import rollout
 from rare_envs.study import arguments, writing
 from rare_envs.study.arguments import BadInput, Question, RunInterrupted, UnwrittenResults, as_bad_input, output_folder
-from rare_envs.study.ego_check import ACTION_ROUNDING
 from rare_envs.study.episodes import EpisodeTable
 from rare_envs.study.failures import CrashKinds, classify_failures, drive_by_others
+from rare_envs.study.probe import ACTION_ROUNDING
 from rare_envs.study.question import (
     Study,
     build_problem,

@@ -13,7 +13,8 @@ import pytest
 import rare_envs
 from agents import load_ego
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check import Finding, exit_code, run_checks
+from rare_envs.study.ego_check import exit_code, run_checks
+from rare_envs.study.probe import Finding
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 FOLDER = Path(__file__).parents[2] / "examples" / "remote"

@@ -17,7 +17,8 @@ from typer.testing import Result
 import agents
 from agents.safe_pickle import find_origin_risks
 from rare_envs.study.arguments import Question
-from rare_envs.study.ego_check import Finding, check_ego, exit_code, run_checks
+from rare_envs.study.ego_check import check_ego, exit_code, run_checks
+from rare_envs.study.probe import Finding
 from tests.rare_envs.study.refusals import in_file
 
 Cli = Callable[..., Result]

@@ -15,7 +15,8 @@ import rare_envs
 from rare_envs.egos.needs import EgoWarning
 from rare_envs.study import BadInput, Question, prepare
 from rare_envs.study.arguments import KEYS, list_arguments, read_question_file
-from rare_envs.study.ego_check import Finding, run_checks
+from rare_envs.study.ego_check import run_checks
+from rare_envs.study.probe import Finding
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused, in_file
 
 STRICT = """
