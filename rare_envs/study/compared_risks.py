@@ -1,216 +1,52 @@
 """Comparison of two egos by collisions per million km, near-crashes and injuries, summed over scenarios.
 
-Rates of scenarios are added as in `rare_envs.exposure`. Near-crashes are less rare than crashes and have a run of their
-own, with `NEAR_SHARE` of the simulations.
+Near-crashes are less rare than crashes and have a run of their own, with `NEAR_SHARE` of the simulations.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import samplers
 from rare_envs import exposure
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.egos.reference import REFERENCE_EGOS
 from rare_envs.files import format_json, replace_text
-from rare_envs.people import COUNTED, HumanBenchmark, add_people, people_in
+from rare_envs.people import HumanBenchmark
 from rare_envs.startup import __version__
 from rare_envs.study import text, writing
-from rare_envs.study.arguments import Question, as_bad_input, output_folder
-from rare_envs.study.comparison import DELTA_V, INJURIES, ComparedEgos, compare_egos, list_kinds, list_numbers
-from rare_envs.study.question import CHANGEABLE, note_question, open_question, prepare
-from rare_envs.study.report import MODEL_NOUN, find_frequency, fold_spread
-from rare_envs.study.risk import SCENARIO_SET, choose_scenarios, list_asked
-from rare_envs.study.run_folder import COMPARISON, FAILURES, JOURNAL, SIDES
+from rare_envs.study.arguments import Question, as_bad_input
+from rare_envs.study.comparison import (
+    DELTA_V,
+    INJURIES,
+    ComparedEgos,
+    RateComparison,
+    compare_egos,
+    list_kinds,
+    list_numbers,
+)
+from rare_envs.study.question import open_question, prepare
+from rare_envs.study.report import MODEL_NOUN, find_frequency
+from rare_envs.study.risk import SCENARIO_SET, Risk, add_risks, choose_scenarios, describe_command, list_asked
+from rare_envs.study.run_folder import COMPARISON, FAILURES, SIDES
 from samplers.analysis.gate import find_doubt, judge_ends
-from samplers.comparison import RATIO_COARSE, Comparison, Side, format_sides, list_ratio_rows
+from samplers.comparison import RATIO_COARSE, Comparison, list_ratio_rows
 from samplers.evaluate import Executor
 from samplers.output import LABEL, MOST_LINES, WIDTH, Row, fold_rows, say
-from samplers.problem import FloatArray, check_whole
+from samplers.problem import check_whole
 from samplers.result import list_warnings
 
-LEAST = 1e-300
-"""Floor of a ratio whose logarithm is taken."""
 CRASHES, NEAR_CRASHES = "crashes", "near_crashes"
 """What is compared beside `INJURIES` and `DELTA_V`; near-crashes with crashes."""
 NEAR_SHARE = 0.25
 """Part of max_sim that is for near-crashes."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RateComparison:
-    """Rates of two egos per million km in the same draws of several scenarios, and the ratio of their sums."""
-
-    scenarios: Mapping[str, Comparison]
-    """The comparison in each scenario, by name."""
-    frequencies: Mapping[str, EventFrequency]
-    """How often the events of each scenario happen."""
-
-    @cached_property
-    def rates(self) -> dict[str, exposure.TotalRate]:
-        """Rates per million km: of A, of B, and by which egos have them in the same draws."""
-        names = ("a", "b", *next(iter(self.scenarios.values())).parts)
-        return {
-            each: exposure.TotalRate(
-                tuple(
-                    self._rate(name, {"a": pair.a, "b": pair.b, **pair.parts}[each])
-                    for name, pair in self.scenarios.items()
-                )
-            )
-            for each in names
-        }
-
-    def _rate(self, name: str, side: Side, exact: bool = False) -> exposure.CollisionRate:
-        """Return the rate of one ego, or of both, in a scenario, with the error of the traffic model unless `exact`."""
-        pair, (low, high) = self.scenarios[name], side.interval
-        fold, spread = fold_spread(None if exact else pair.either.base_uncertainty)
-        of_traffic = exposure.normal_quantile(pair.confidence) * spread
-        if side.p > 0:
-            below, above = (
-                math.exp(math.hypot(fold * math.log(far), of_traffic))
-                for far in (side.p / max(low, LEAST), high / side.p)
-            )
-            low, high = side.p / below, side.p * above
-        else:
-            if (pair.a.p > 0) != (pair.b.p > 0):  # the ratio says how rare the failures of the other are
-                least, most = pair.interval
-                high = min(high, pair.a.p / max(least, LEAST) if pair.a.p > 0 else pair.b.p * most)
-            high *= math.exp(of_traffic)
-        return exposure.CollisionRate(
-            scenario=name,
-            frequency=self.frequencies[name],
-            p=side.p,
-            sampling_log_sd=fold * side.cov if side.p > 0 else 0.0,
-            base_log_sd=spread,
-            interval=(low, min(high, 1.0)),
-            confidence=pair.confidence,
-        )
-
-    @property
-    def per_million_km(self) -> dict[str, float]:
-        """The values of `rates`."""
-        return {name: rate.per_million_km for name, rate in self.rates.items()}
-
-    @property
-    def shares(self) -> dict[str, float]:
-        """Of all events of the scenarios: in which both have it, only A, only B, and neither."""
-        events = exposure.MILLION_KM * sum(self.frequencies[name].per_km for name in self.scenarios)
-        shares = {name: rate / events for name, rate in self.per_million_km.items() if name not in ("a", "b")}
-        return {**shares, "neither": 1.0 - sum(shares.values())}
-
-    @property
-    def ratio(self) -> float:
-        """Rate of A over that of B; inf if B has none, NaN if neither has."""
-        a, b = self.per_million_km["a"], self.per_million_km["b"]
-        return a / b if b > 0 else math.inf if a > 0 else math.nan
-
-    @property
-    def confidence(self) -> float:
-        """Nominal coverage of the intervals."""
-        return next(iter(self.scenarios.values())).confidence
-
-    @cached_property
-    def interval(self) -> tuple[float, float]:
-        """Interval of the ratio with the errors of the traffic models."""
-        return self._find_interval(exact=False)
-
-    @cached_property
-    def interval_if_exact(self) -> tuple[float, float]:
-        """Interval of the ratio if the traffic models are exact."""
-        return self._find_interval(exact=True)
-
-    def _draw(self, exact: bool) -> FloatArray:
-        """Return draws of the sums of A and of B per million km, the least and the most of each, (2, 2, n).
-
-        From draws of B's rate in each scenario and of the ratio there, by its interval, with the traffic model or if
-        that is `exact`. An ego without a failure in a scenario has 0 there for one limit, and its upper one for the
-        other.
-        """
-        rng, n = np.random.default_rng(0), exposure.RATE_DRAWS
-        ends = np.zeros((2, 2, n))
-        for name, pair in self.scenarios.items():
-            known = None if exact else pair.base_uncertainty
-            low, high = pair.interval if known is None or known.interval is None else known.interval
-            a, b = (self._rate(name, side, exact).draw(rng.standard_normal(n), rng) for side in (pair.a, pair.b))
-            if pair.a.p > 0 and pair.b.p > 0:
-                error = rng.standard_normal(n) / exposure.normal_quantile(pair.confidence)
-                away = np.where(error < 0, math.log(pair.ratio / max(low, LEAST)), math.log(high / pair.ratio))
-                a = b * pair.ratio * np.exp(away * error)
-            elif pair.a.p > 0:
-                b = a / max(low, LEAST)
-            elif pair.b.p > 0:
-                a = b * high
-            ends += np.stack([(a if pair.a.p > 0 else 0.0 * a, a), (b if pair.b.p > 0 else 0.0 * b, b)])
-        return ends
-
-    def _find_interval(self, exact: bool) -> tuple[float, float]:
-        """Return the interval of the ratio."""
-        ends, tails = self._draw(exact), exposure.tail_levels(self.confidence)
-        if not ends[:, 0].any():
-            return 0.0, math.inf
-        with np.errstate(divide="ignore", invalid="ignore"):
-            least, most = ends[0, 0] / ends[1, 1], np.where(ends[1, 0] > 0, ends[0, 1] / ends[1, 0], math.inf)
-        return float(np.quantile(least, tails[0])), float(np.quantile(most, tails[1], method="inverted_cdf"))
-
-    @property
-    def left_out(self) -> str:
-        """Why the error of a traffic model is not in the interval; empty if it is."""
-        for name, pair in self.scenarios.items():
-            known, either = pair.base_uncertainty, pair.either.base_uncertainty
-            if known is not None and known.interval is None:
-                return f"{text.name_scenario(name)}: {known.reason.rstrip('.')}"
-            if either is not None and not math.isfinite(either.spread):
-                return f"{text.name_scenario(name)}: {either.reason.rstrip('.')}"
-        return ""
-
-    def count_people(self, *outcomes: str) -> HumanBenchmark | None:
-        """Return what people had of outcomes in the same events together; None if it was not counted in one kind."""
-        kinds: list[str] = []
-        for name, pair in self.scenarios.items():
-            kinds += [part.name for part in pair.either.parts if part.name in COUNTED] or [name]
-        known = [getattr(people_in(k), each) if k in COUNTED else None for k in kinds for each in outcomes]  # type: ignore[arg-type]
-        return add_people(known)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Doubts about the ratios and about the errors of their traffic models, by scenario."""
-        return self._name(lambda pair: pair.all_warnings)
-
-    def _name(self, find: Callable[[Comparison], Sequence[str]]) -> tuple[str, ...]:
-        """Return texts about the scenarios, each behind the name of its own."""
-        return tuple(
-            f"{text.name_scenario(name)}: {each}" for name, pair in self.scenarios.items() for each in find(pair)
-        )
-
-    def tabulate(self, label: str, people: HumanBenchmark | None) -> tuple[str, ...]:
-        """Return a row of the table of outcomes: rates of A and B, their ratio, both, only A, only B, and people."""
-        said = text.format_ratio(self.ratio, self.interval)
-        rates = format_sides([(rate.per_million_km, rate.interval_per_million_km) for rate in self.rates.values()])
-        return (label, *rates[:2], said, *rates[2:], text.format_rate(people.per_million_km) if people else "")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; infinities and NaN become None."""
-        low, high, ratio = (end if math.isfinite(end) else None for end in (*self.interval, self.ratio))
-        return {
-            "ratio": ratio,
-            "interval": [low, high],
-            "confidence": self.confidence,
-            "per_million_km": self.per_million_km,
-            "intervals_per_million_km": {name: [*rate.interval_per_million_km] for name, rate in self.rates.items()},
-            "shares": self.shares,
-            "warnings": [*self.warnings],
-        }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -401,35 +237,34 @@ def compare_risks(
         >>> found.per_million_km["a"], found.ratio
         (0.0, nan)
     """
-    whole: dict[str, Any] = {
-        "command": writing.SUM,
-        "ego_a": ego_a,
-        "ego_b": ego_b,
-        "scenarios": [*scenarios],
-        "site": site,
-        "bases": {name: str(base) for name, base in (bases or {}).items()},
-        "b": {"algo_b": algo_b, "stats_b": stats_b},
-        "chunked": executor is not None,
-        "options": {name: value for name, value in options.items() if name not in CHANGEABLE},
-    }
+    egos: dict[str, Any] = {"ego_a": ego_a, "ego_b": ego_b, "b": {"algo_b": algo_b, "stats_b": stats_b}}
+    about = {"command": writing.SUM, **egos, "scenarios": [*scenarios], "sites": [site]}
+    whole = describe_command(bases, executor, options, **about)
     return _compare_sums(whole, None if out is None else Path(out), progress, force, executor, options)
 
 
-def resume_compared_risks(
-    folder: Path, questions: Mapping[str, Question], whole: Mapping[str, Any], **how: Any
-) -> RiskComparison:
-    """Continue an interrupted comparison of risks, as `resume_risk`."""
-    trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
+def resume_sum(
+    folder: Path,
+    questions: Mapping[str, Question],
+    whole: Mapping[str, Any],
+    trust: bool = False,
+    executor: Executor | None = None,
+    on_error: str | None = None,
+) -> Risk | RiskComparison:
+    """Continue an interrupted risk or comparison of risks; the answer is that of an undisturbed one.
+
+    `whole` are its arguments, and `questions` those that it has begun; faults of a risk may count otherwise from now.
+    """
+    first = next(iter(questions.values()))
     with as_bad_input(KeyError, TypeError, AttributeError):
-        for question in _list_asked(whole):
+        for question in list_asked(whole):
             open_question(asdict(question), folder, trust)
-        options = {**whole["options"], "trust": trust, "device": first.device}  # the cores of A and B may differ
-        return _compare_sums(dict(whole), folder, True, False, executor, options)
-
-
-def _list_asked(whole: Mapping[str, Any]) -> list[Question]:
-    b = {"ego": whole["ego_b"], "algo": whole["b"]["algo_b"], "stats": whole["b"]["stats_b"]}
-    return list_asked(whole, {"ego": whole["ego_a"]}, b)
+        options = {**whole["options"], "trust": trust, "device": first.device}
+        if whole["command"] == writing.SUM:  # the cores of A and B may differ
+            return _compare_sums(dict(whole), folder, True, False, executor, options)
+        known = (question.on_error for question in questions.values())  # one may have gone on alone, by another
+        options |= {"core": first.core, "on_error": on_error or max(known, key=lambda each: each != "raise")}
+        return add_risks(whole["ego"], dict(whole), folder, True, False, executor, options)
 
 
 def _ask_near(question: Question) -> tuple[Question, Question]:
@@ -453,27 +288,15 @@ def _compare_sums(
     """Compare two egos from checked arguments, `whole`, which the parts record."""
     ego_a, ego_b, of_b, asked = whole["ego_a"], whole["ego_b"], whole["b"], dict[str, Question]()
     with as_bad_input(TypeError, ValueError):
-        chosen = choose_scenarios(whole["scenarios"], [whole["site"]], whole["bases"])
+        chosen = choose_scenarios(whole["scenarios"], whole["sites"], whole["bases"])
         frequencies = dict[str, EventFrequency]()
         for name, (env_id, base) in chosen.items():
             asked[name], asked[f"{name}_{NEAR_CRASHES}"] = _ask_near(
                 Question(env_id=env_id, base=base, ego=ego_a, **options)
             )
             frequencies[name] = find_frequency(prepare(asked[name]))
-    if folder is not None:
-        for each in [] if options.get("trust") else _list_asked(whole):  # what needed trust needs it again
-            note_question(each)
-        parts = {folder / name / side: each for name, each in asked.items() for side in SIDES}
-        if force:
-            clear_folders = (folder, *(folder / name for name in asked))
-            writing.clear_runs(parts)
-            for path, file in itertools.product(clear_folders, (COMPARISON, FAILURES)):
-                (path / file).unlink(missing_ok=True)
-        writing.check_no_results(folder, COMPARISON)
-        for name in asked:
-            if not any((folder / name / side / JOURNAL).exists() for side in SIDES):
-                writing.check_no_results(folder / name, COMPARISON)
-    with contextlib.nullcontext() if folder is None else output_folder(folder, COMPARISON, folders=asked):
+    parts = {f"{name}/{side}": each for name, each in asked.items() for side in SIDES}
+    with writing.folder_of_parts(folder, parts, list_asked(whole), force, COMPARISON, FAILURES):
         pairs = {}
         for name, question in asked.items():
             part = None if folder is None else folder / name
@@ -486,10 +309,6 @@ def _compare_sums(
         if folder is not None:
             with writing.unwritten_results(folder, found):
                 replace_text(folder / COMPARISON, format_json(found.to_dict()) + "\n")
-            for side in parts:
-                (side / JOURNAL).unlink(missing_ok=True)
-                with contextlib.suppress(OSError):  # it has more
-                    side.rmdir()
     return found
 
 

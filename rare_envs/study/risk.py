@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -25,13 +24,13 @@ from rare_envs.scenarios.base import Scenario, load_base
 from rare_envs.scenarios.registry import env_id_of, find_scenario, split_layout
 from rare_envs.startup import __version__
 from rare_envs.study import text
-from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer, output_folder
+from rare_envs.study.arguments import Question, RunInterrupted, as_bad_input, keep_answer
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.plots import save_risk_plot
-from rare_envs.study.question import CHANGEABLE, Study, build_problem, note_question, open_question, prepare
+from rare_envs.study.question import CHANGEABLE, Study, build_problem, prepare
 from rare_envs.study.report import Report, find_frequency, judge_rate
 from rare_envs.study.run_folder import JOURNAL, RISK
-from rare_envs.study.writing import begin_journal, check_no_results, clear_runs, unwritten_results
+from rare_envs.study.writing import begin_journal, folder_of_parts, unwritten_results
 from samplers.evaluate import Executor
 from samplers.output import MOST_LINES, WIDTH, Row, fold_rows
 from samplers.result import list_warnings
@@ -241,7 +240,7 @@ class Risk:
     def details(self) -> str:
         """Return the traffic behind each scenario, what the columns are, and all notes and warnings."""
         lines = [f"traffic      {'; '.join(each.describe_traffic() for each in self.scenarios)}"]
-        lines += [f"human model  {text.describe_columns()}"]
+        lines += [f"human model  {text.COLUMNS}"]
         return "\n".join(
             [*lines, *(f"note: {each}" for each in self.notes), *(f"warning: {each}" for each in self.warnings)]
         )
@@ -297,7 +296,7 @@ def risk(
             scenario must have a base of the first site, or one in `bases`.
         bases: Traffic models, names or JSON files, by scenario, in place of those of the first site.
         out: Folder for the picture, the numbers and a folder of each scenario. After an interruption the same call,
-            or `resume_risk`, continues with the simulations that it has, unless the ego is an object.
+            or `rare-envs resume`, continues with the simulations that it has, unless the ego is an object.
         progress: Show a bar on standard error.
         force: Replace runs that the folder has, finished or not.
         executor: Where simulations are made, as in `rare_envs.study.run`.
@@ -318,46 +317,36 @@ def risk(
     """
     sites = [sites] if isinstance(sites, str) else [*sites]
     scenarios = [scenarios] if isinstance(scenarios, str) else [*scenarios]
-    whole: dict[str, Any] = {
-        "command": "risk",
-        "ego": ego if isinstance(ego, str) else "",
-        "scenarios": scenarios,
-        "sites": sites,
-    }
-    whole |= {"bases": {name: str(base) for name, base in (bases or {}).items()}, "chunked": executor is not None}
-    whole |= {"options": {name: value for name, value in options.items() if name not in CHANGEABLE}}
-    return _risk(ego, whole, bases or {}, None if out is None else Path(out), progress, force, executor, options)
+    about = {"command": "risk", "ego": ego if isinstance(ego, str) else "", "scenarios": scenarios, "sites": sites}
+    whole = describe_command(bases, executor, options, **about)
+    return add_risks(ego, whole, None if out is None else Path(out), progress, force, executor, options)
 
 
-def resume_risk(folder: Path, questions: Mapping[str, Question], whole: Mapping[str, Any], **how: Any) -> Risk:
-    """Continue an interrupted risk from its arguments, `whole`, and the questions that it has begun.
-
-    The answer is that of an undisturbed one; `how` has trust, an executor and, if it is to change, on_error.
-    """
-    trust, executor, first = how["trust"], how["executor"], next(iter(questions.values()))
-    with as_bad_input(KeyError, TypeError, AttributeError):
-        for question in list_asked(whole, {"ego": whole["ego"]}):
-            open_question(asdict(question), folder, trust)
-        options = {**whole["options"], "trust": trust, "core": first.core, "device": first.device}
-        known = (question.on_error for question in questions.values())  # one may have gone on alone, by another
-        options["on_error"] = how["on_error"] or max(known, key=lambda each: each != "raise")
-        return _risk(whole["ego"], dict(whole), whole["bases"], folder, True, False, executor, options)
+def describe_command(
+    bases: Mapping[str, str | PathLike[str]] | None, executor: Executor | None, options: Mapping[str, Any], **about: Any
+) -> dict[str, Any]:
+    """Return what a command over scenarios is `about`, and its arguments, which the journals of its parts have."""
+    named = {name: str(base) for name, base in (bases or {}).items()}
+    asked = {name: value for name, value in options.items() if name not in CHANGEABLE}
+    return {**about, "bases": named, "chunked": executor is not None, "options": asked}
 
 
-def list_asked(whole: Mapping[str, Any], *egos: Mapping[str, Any]) -> list[Question]:
+def list_asked(whole: Mapping[str, Any]) -> list[Question]:
     """Return questions with all that the arguments of a command over scenarios name; nothing of it is loaded.
 
-    There is one for each ego, with its fields of a question, in each environment and base, in any spelling.
+    There is one for each ego in each environment and base, in any spelling.
     """
-    names, bases = [*whole["scenarios"], *whole["bases"]], whole["bases"]
+    names, bases, egos = [*whole["scenarios"], *whole["bases"]], whole["bases"], [{"ego": whole.get("ego")}]
+    if "b" in whole:
+        b = {"ego": whole["ego_b"], "algo": whole["b"]["algo_b"], "stats": whole["b"]["stats_b"]}
+        egos = [{"ego": whole["ego_a"]}, b]
     worlds = [{**whole["options"], "env_id": name, "base": bases.get(name)} for name in names]
     return [Question(**{**world, **ego}) for world in worlds for ego in egos]
 
 
-def _risk(
+def add_risks(
     ego: Any,
     whole: dict[str, Any],
-    bases: Mapping[str, str | PathLike[str]],
     folder: Path | None,
     progress: bool,
     force: bool,
@@ -365,12 +354,10 @@ def _risk(
     options: Mapping[str, Any],
 ) -> Risk:
     """Estimate a risk from its checked arguments, `whole`, which its parts record."""
-    scenarios, sites = whole["scenarios"], whole["sites"]
     named = isinstance(ego, str)
     ego_name = ego if named else type(ego).__name__
-    with as_bad_input(ValueError):
-        chosen = choose_scenarios(scenarios, sites, bases)
     with as_bad_input(TypeError, ValueError):
+        chosen = choose_scenarios(whole["scenarios"], whole["sites"], whole["bases"])
         if options.get("max_p") is not None:
             raise ValueError("Expected max_rate, a limit of the sum, not max_p.")
         asked = {**options, "ego": ego_name}
@@ -384,24 +371,15 @@ def _risk(
         studies = [prepare(question, None if named else ego) for question in fitting.values()]
         for study in studies:
             find_frequency(study)
-    if folder is not None and not options.get("trust"):  # what needed trust needs it again
-        for question in list_asked(whole, {"ego": whole["ego"]}):
-            note_question(question)
-    with contextlib.nullcontext() if folder is None else output_folder(folder, RISK, PICTURE, folders=fitting):
-        if folder is not None and force:
-            (folder / RISK).unlink(missing_ok=True)
-            clear_runs({folder / name: study.question for name, study in zip(fitting, studies, strict=True)})
-        elif folder is not None:  # all of them, before the first one is run
-            check_no_results(folder, RISK)
-            for part, study in ((folder / name, study) for name, study in zip(fitting, studies, strict=True)):
-                if not (part / JOURNAL).exists():
-                    check_no_results(part)
-                elif named:  # wherever it is stopped, all go on by the on_error of now
-                    begin_journal(part, study.question, whole=whole).close()
+    parts = {name: study.question for name, study in zip(fitting, studies, strict=True)}
+    with folder_of_parts(folder, parts, list_asked(whole), force, RISK, PICTURE):
+        for path, question in ((folder / name, part) for name, part in parts.items()) if folder and named else ():
+            if (path / JOURNAL).exists():  # wherever it is stopped, all go on by the on_error of now
+                begin_journal(path, question, whole=whole).close()
         done: list[ScenarioRisk] = []
         for study in studies:
             try:
-                done.append(_evaluate(study, sites[1:], folder, progress, executor, whole))
+                done.append(_evaluate(study, whole["sites"][1:], folder, progress, executor, whole))
             except RunInterrupted as error:
                 known = "; ".join(
                     f"{one.name} {text.format_rate(one.rate.per_million_km)} per million km" for one in done
@@ -412,8 +390,6 @@ def _risk(
             with unwritten_results(folder, found):
                 found.save_plot(folder / PICTURE)
                 replace_text(folder / RISK, format_json(found.to_dict()) + "\n")
-            for name in fitting:
-                (folder / name / JOURNAL).unlink(missing_ok=True)
     return found
 
 

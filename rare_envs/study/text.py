@@ -205,12 +205,11 @@ def tabulate_events(events: Sequence[EventRate], total: exposure.TotalRate | Non
     return [head, *table, *lines[len(events) :]]
 
 
-def describe_columns() -> str:
-    """Return what the columns of people and of the human driver model are."""
-    return (
-        f"{MODEL} and {NO_HEADWAY_RULE} in the same events; a rate is calibrated within a factor of "
-        f"{people.CALIBRATED_WITHIN:g} of people's interval (people: 100-Car, contacts at any speed)"
-    )
+COLUMNS = (
+    f"{MODEL} and {NO_HEADWAY_RULE} in the same events; a rate is calibrated within a factor of "
+    f"{people.CALIBRATED_WITHIN:g} of people's interval (people: 100-Car, contacts at any speed)"
+)
+"""What the columns of people and of the human driver model are."""
 
 
 def describe_uncertainty(total: exposure.TotalRate) -> str:
@@ -221,17 +220,13 @@ def describe_uncertainty(total: exposure.TotalRate) -> str:
         high = format_rate(rate.interval_per_million_km[1])
         parts.append(say(fact, name=name_scenario(rate.scenario), high=high))
     if total.shares:
-        texts = format_shares([each.share for each in total.shares])
-        sources = ", ".join(f"{text} {name_source(each)}" for text, each in zip(texts, total.shares, strict=True))
-        parts.append(f"{'the rest: ' if parts else ''}{sources}")
+        sources = []
+        for text, each in zip(format_shares([each.share for each in total.shares]), total.shares, strict=True):
+            scenario = name_scenario(each.scenario)
+            nouns = {"base": f"{scenario} {MODEL_NOUN}", "site": f"{scenario} at other sites", **SOURCE_NOUNS}
+            sources.append(f"{text} {nouns[each.source]}")
+        parts.append(f"{'the rest: ' if parts else ''}{', '.join(sources)}")
     return "; ".join(parts)
-
-
-def name_source(each: exposure.VarianceShare) -> str:
-    """Return a source of uncertainty in words, such as "cut-in traffic model"."""
-    scenario = name_scenario(each.scenario)
-    nouns = {"base": f"{scenario} {MODEL_NOUN}", "site": f"{scenario} at other sites", **SOURCE_NOUNS}
-    return nouns[each.source]
 
 
 Result = Mapping[str, Any]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import itertools
 import json
 import platform
 import shlex
@@ -192,14 +193,12 @@ def journals_of(
         if out is None:
             yield [None for _ in questions]
             return
-        stack.enter_context(output_folder(out, *results, folders=filter(None, questions)))
-        parts, journals = {out / name: question for name, question in questions.items()}, list[Journal]()
-        if force:
-            clear_runs(parts)
-            for name in results:
-                (out / name).unlink(missing_ok=True)
-        for folder, question in parts.items():
-            journals.append(stack.enter_context(contextlib.closing(begin_journal(folder, question, whole=whole))))
+        of_sum, journals = whole["command"] == SUM, list[Journal]()
+        whole_folder = output_folder(out, *results, folders=questions)
+        stack.enter_context(whole_folder if of_sum else folder_of_parts(out, questions, (), force, *results))
+        for name, question in questions.items():
+            journal = begin_journal(out / name, question, whole=whole)
+            journals.append(stack.enter_context(contextlib.closing(journal)))
             note_question(question)
         try:
             yield journals
@@ -209,16 +208,43 @@ def journals_of(
                     journal.remove()
                 raise
             trust = any(question.trust for question in questions.values())
-            resumed = out.parent if whole["command"] == SUM else out
-            again = f"{error} {kept:,} simulations are kept; go on with: {advise_resume(resumed, trust)}"
+            resumed = advise_resume(out.parent if of_sum else out, trust)
+            again = f"{error} {kept:,} simulations are kept; go on with: {resumed}"
             kind = RunInterrupted if isinstance(error, KeyboardInterrupt) else UnwrittenResults
             raise kind(again, getattr(error, "report", None)) from error
-        for folder, journal in zip(parts, journals, strict=True):
-            if whole["command"] == SUM:
-                continue
-            journal.remove()
+
+
+@contextlib.contextmanager
+def folder_of_parts(
+    folder: Path | None, parts: Mapping[str, Question], asked: Sequence[Question], force: bool, *results: str
+) -> Iterator[None]:
+    """Make the folder of a command, in which parts that were begun go on; their journals end with it.
+
+    Parts are named by their paths in it. What was asked is noted, unless it needed trust, and needs it again. `force`
+    removes earlier results; without it the first of them is refused.
+    """
+    if folder is None:
+        yield
+        return
+    for question in asked if not any(each.trust for each in parts.values()) else ():
+        note_question(question)
+    paths = {folder / name: question for name, question in parts.items()}
+    owners = {folder / name.partition("/")[0]: name.partition("/")[0] for name in parts}
+    with output_folder(folder, *results, folders=filter(None, owners.values())):
+        if force:
+            clear_runs(paths)
+            for owner, name in itertools.product((folder, *owners), results):
+                (owner / name).unlink(missing_ok=True)
+        else:  # all of them, before the first one is run
+            check_no_results(folder, results[0])
+        for owner in owners:
+            if not any((path / run_folder.JOURNAL).exists() for path in paths if path.is_relative_to(owner)):
+                check_no_results(owner, results[0])
+        yield
+        for path in paths:
+            (path / run_folder.JOURNAL).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it has results
-                folder.rmdir()
+                path.rmdir()
 
 
 def clear_runs(parts: Mapping[Path, Question]) -> None:

@@ -147,8 +147,6 @@ def estimate_highway_env(
     if not vehicles.startswith("highway_env.") and not question.trust:
         raise BadInput(f"The file of env_config names code, {vehicles!r}: let it run by --trust.")
     file = None if out is None else out / ESTIMATE_FILE
-    if out is not None and not force:
-        writing.check_no_results(out, ESTIMATE_FILE)
     with as_bad_input(ValueError, OSError, TypeError):
         method, arguments = find_method(question.method), asdict(question.run_arguments)
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
@@ -350,9 +348,5 @@ def resume_command(
         return estimate_highway_env(opened, whole["env_config"], folder, False, details, executor)
     if command == "compare":
         return tell(comparison.resume_comparison(folder, questions, trust, executor), folder, details)
-    from rare_envs.study.risk import resume_risk
-
-    resume = compared_risks.resume_compared_risks if command == writing.SUM else resume_risk
     with as_bad_input(ValueError):
-        how = {"trust": trust, "executor": executor, "on_error": on_error}
-        return tell(resume(folder, questions, whole, **how), folder, details)
+        return tell(compared_risks.resume_sum(folder, questions, whole, trust, executor, on_error), folder, details)

@@ -14,8 +14,8 @@ import samplers
 from rare_envs.distributions.events import EventFrequency
 from rare_envs.exposure import MILLION_KM
 from rare_envs.study.arguments import BadInput
-from rare_envs.study.compared_risks import RateComparison, RiskComparison, compare_risks
-from rare_envs.study.comparison import compare_egos, weigh_crashes
+from rare_envs.study.compared_risks import RiskComparison, compare_risks
+from rare_envs.study.comparison import RateComparison, compare_egos, weigh_crashes
 from rare_envs.study.question import Question
 from rare_envs.study.run_folder import read_failures
 from tests.rare_envs.study.conftest import write_base
