@@ -203,6 +203,11 @@ def parse_json_object(text: str, source: str) -> dict[str, Any]:
     return data
 
 
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Return the JSON object of an ordinary file; see `read_text_file`."""
+    return parse_json_object(read_text_file(path), repr(str(path)))
+
+
 def format_json(value: dict[str, Any]) -> str:
     """Return JSON with one entry per line, but lists of numbers in one line."""
     text = json.dumps(value, indent=2, allow_nan=False)

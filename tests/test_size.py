@@ -11,10 +11,10 @@ from benchmarks.size import BUDGETS, measure_text
 
 ROOT = Path(__file__).parents[1]
 LIMITS = {
-    "package lines": 57_850,
-    "code lines": 36_780,
-    "modules": 214,
-    "functions": 3_230,
+    "package lines": 57_770,
+    "code lines": 36_740,
+    "modules": 215,
+    "functions": 3_215,
     "classes": 472,
     "import lines, percent of code": 10.5,
     "test lines": 33_770,

@@ -17,7 +17,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from rare_envs.files import open_ordinary, parse_json_object, read_text_file
+from rare_envs.files import open_ordinary, read_json
 from rare_envs.plugins import clean_text
 from rare_envs.study.run_folder import DIGESTED, EVIDENCE, RESULT, RISK, STUDY
 from rare_envs.study.text import format_probability, format_rate, name_scenario
@@ -44,7 +44,7 @@ def judge_leaf(folder: Path, leaf: Mapping[str, Any]) -> str:
     A file whose digest is not that in manifest.json supports nothing; for test cases their own files count too. One
     that cannot be read is an OSError, one without a JSON object a ValueError.
     """
-    file, value = leaf["file"], read_pointer(read_object(folder / leaf["file"]), leaf["pointer"])
+    file, value = leaf["file"], read_pointer(read_json(folder / leaf["file"]), leaf["pointer"])
     if value in (None, ""):
         return "not known"
     files = (file, f"{EVIDENCE}/test_cases/") if file.endswith(TEST_CASES) else (file,)
@@ -78,7 +78,10 @@ def find_changed(folder: Path, files: tuple[str, ...] = ("",), known: Digests | 
     They are relative to the folder; `files` are the beginnings of those that are looked at.
     """
     known = {} if known is None else known
-    filed, found = read_object(folder / EVIDENCE / MANIFEST).get("sha256") or {}, digest_files(folder, files, known)
+    filed, found = (
+        read_json(folder / EVIDENCE / MANIFEST).get("sha256") or {},
+        digest_files(folder, files, known),
+    )
     names = {name for name in (*filed, *found) if name.startswith(files)}
     return sorted(name for name in names if found.get(name) != filed.get(name))
 
@@ -108,16 +111,11 @@ def digest_file(path: Path) -> str:
 
 def list_runs(folder: Path) -> list[Path]:
     """Return the folders of the runs of a risk; none if it is none."""
-    names = [*map(str, read_object(folder / RISK).get("scenarios") or ())] if (folder / RISK).is_file() else []
+    names = [*map(str, read_json(folder / RISK).get("scenarios") or ())] if (folder / RISK).is_file() else []
     for name in names:
         if Path(name).name != name or (folder / name).resolve().parent != folder.resolve():
             raise ValueError(f"Expected names of folders in {str(folder)!r} as scenarios of its {RISK}, got {name!r}.")
     return [folder / name for name in names]
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """Return the object of a JSON file."""
-    return parse_json_object(read_text_file(path), repr(str(path)))
 
 
 Goals = dict[str, list[tuple[str, str, str, Any]]]

@@ -22,7 +22,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.stats import poisson
 
-from rare_envs.files import format_json, replace_text
+from rare_envs.files import format_json, read_json, replace_text
 from rare_envs.scenarios.registry import env_id_of, find_scenario
 from rare_envs.simulation.terms import EpisodeTerms
 from rare_envs.startup import __version__
@@ -97,7 +97,7 @@ def write_evidence(folder: Path, trust: bool = False) -> tuple[Path, ...]:
     if not (folder / RISK).is_file():
         return _write_evidence_of_run(folder, trust, known)[1]
     with as_bad_input(OSError, ValueError):
-        runs, recorded = claims.list_runs(folder), claims.read_object(folder / RISK)
+        runs, recorded = claims.list_runs(folder), read_json(folder / RISK)
         filed = claims.find_changed(folder, known=known) if (folder / EVIDENCE / claims.MANIFEST).is_file() else []
     found = {part.name: _write_evidence_of_run(part, trust, known) for part in runs}
     reports, out = {name: report for name, (report, _) in found.items()}, folder / EVIDENCE
@@ -161,7 +161,7 @@ def _seal(folder: Path, known: Known) -> None:
 def sum_up(files: Sequence[Path]) -> tuple[list[str], str, str]:
     """Return the files found to be changed, the manifest with digests of all, and its own, to be kept elsewhere."""
     last = {path.name: path for path in files}
-    changed = list(claims.read_object(last[claims.VALIDATION])["changed"])
+    changed = list(read_json(last[claims.VALIDATION])["changed"])
     return changed, str(last[claims.MANIFEST]), claims.digest_file(last[claims.MANIFEST])
 
 
@@ -454,7 +454,7 @@ def describe_sum(
     """Return the files of the evidence of a risk by name, from risk.json, and the evidence and reports of its runs."""
     parts = [folder / name / EVIDENCE for name in reports]
     coverage, uncertainty, validation, origin = (
-        {part.parent.name: claims.read_object(part / key) for part in parts}
+        {part.parent.name: read_json(part / key) for part in parts}
         for key in (claims.COVERAGE, claims.UNCERTAINTY, claims.VALIDATION, claims.ORIGIN)
     )
     cells = [cell for each in coverage.values() for cell in each["iso_34502"]["covered"]]
@@ -504,7 +504,7 @@ def describe_sum(
 def find_dropped(folder: Path, recorded: Mapping[str, Any]) -> dict[str, str]:
     """Return scenarios that risk.json does not name, by name: their runs lie there, or its runs say they were asked."""
     runs = [path.parent.name for path in folder.glob(f"*/{STUDY}")]
-    asked = [claims.read_object(folder / run / STUDY).get("scenarios") or () for run in recorded["scenarios"]]
+    asked = [read_json(folder / run / STUDY).get("scenarios") or () for run in recorded["scenarios"]]
     # code that a folder names is not imported for its name
     names = {*runs, *(find_scenario(env_id_of(str(name).rpartition(":")[2])).name for name in chain(*asked))}
     missing = sorted(names - {*recorded["scenarios"], *recorded["left_out"]})

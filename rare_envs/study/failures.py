@@ -119,12 +119,15 @@ class Severity:
 
     def __str__(self) -> str:
         """Return a few lines for people."""
-        curve, shown, (low, high) = self.curve, self._shown_thresholds, self.injuries.interval
-        lines = [f"collisions with delta-v {self._list_speeds()}"]
+        curve, (low, high) = self.curve, self.injuries.interval
+        known = [i for i, v in enumerate(curve.thresholds) if v in SHOWN_DELTA_V and curve.low[i] > 0]
+        shown = {i: f"> {curve.thresholds[i]:g} m/s" for i in known[-SHOWN_THRESHOLDS:]}
+        parts = [f"{v} {curve.p[i]:.1e} [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" for i, v in shown.items()]
+        lines = [f"collisions with delta-v {', '.join([*parts, f'at most {self.largest_delta_v:.2g} m/s'])}"]
         if curve.base is not None and shown:
             base = curve.base
             held = f"{100 * base.confidence:g} % of all thresholds together"
-            parts = [f"> {curve.thresholds[i]:g} m/s {_format_ends(base.low[i], base.high[i])}" for i in shown]
+            parts = [f"{v} {_format_ends(base.low[i], base.high[i])}" for i, v in shown.items()]
             lines.append(f"  traffic model {held}  {', '.join(parts)} ({base.fitted_to}, {base.n_refits} refits)")
         lines.append(
             f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
@@ -136,20 +139,6 @@ class Severity:
         if self.unknown:
             lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
         return "\n".join(lines)
-
-    @property
-    def _shown_thresholds(self) -> list[int]:
-        """Indices of the thresholds that are printed."""
-        known = [i for i, v in enumerate(self.curve.thresholds) if v in SHOWN_DELTA_V and self.curve.low[i] > 0]
-        return known[-SHOWN_THRESHOLDS:]
-
-    def _list_speeds(self) -> str:
-        """Return the curve at the thresholds that are printed, each with its interval, and the largest."""
-        curve, parts = self.curve, []
-        for i in self._shown_thresholds:
-            ends = f" [{curve.low[i]:.1e}, {curve.high[i]:.1e}]"
-            parts.append(f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e}{ends}")
-        return ", ".join([*parts, f"at most {self.largest_delta_v:.2g} m/s"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
@@ -298,14 +287,13 @@ class FailureMode:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        share = {**self.share.to_dict(), "interval": list(self.share.interval)}
-        others = {name: each._asdict() for name, each in self.others.items()}
         return {
             "crash": self.crash,
-            **share,
+            **self.share.to_dict(),
+            "interval": list(self.share.interval),
             "failure": self.failure,
             "center": dict(self.center),
-            "other_drivers": others,
+            "other_drivers": {name: each._asdict() for name, each in self.others.items()},
         }
 
 

@@ -6,7 +6,7 @@ import contextlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -24,7 +24,7 @@ from PIL import Image, ImageDraw
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.envs import rendering
-from rare_envs.exposure import RateInterval, TotalRate
+from rare_envs.exposure import CollisionRate, RateInterval, TotalRate
 from rare_envs.files import replace_file
 from rare_envs.measures import MEASURES
 from rare_envs.people import EventRate, HumanBenchmark
@@ -138,8 +138,7 @@ def _draw_likeliest(figure: Figure, report: Report, x: FloatArray) -> None:
         return
     how = "no crash" if drive.crash is None else describe_contact(drive.crash, drive.names)
     figure.suptitle(f"The most likely failure: {how}", fontweight="bold")
-    for axes, t in zip(figure.subplots(MOMENTS, 1), choose_moments(drive), strict=True):
-        draw_moment(axes, drive, t)
+    draw_moments(figure, drive)
     roles = drive.problem.world.scenario.vehicle_names
     shown = [Patch(color=vehicle_colour(roles[j], j), label=name) for j, name in enumerate(drive.names)]
     figure.legend(handles=shown, loc="outside lower center", ncols=4, frameon=False)
@@ -215,21 +214,12 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)
 
 
-class SeverityRow(NamedTuple):
-    """Collisions with a larger delta-v."""
-
-    km_h: float
-    p: float
-    low: float
-    high: float
-
-
-def list_severity(severity: Mapping[str, Any] | None) -> list[SeverityRow]:
-    """Return P[collision with a larger delta-v] at three delta-v, evenly spread over the curve of a run."""
+def list_severity(severity: Mapping[str, Any] | None) -> list[tuple[float, ...]]:
+    """Return three delta-v [km/h] from the curve of a run, each with P[collision with a larger one] and its ends."""
     if severity is None:
         return []
     columns = (severity["curve"][name] for name in ("delta_v", "p", "low", "high"))
-    rows = [SeverityRow(3.6 * v, *rest) for v, *rest in zip(*columns, strict=True) if rest[0] > 0]
+    rows = [(3.6 * v, *rest) for v, *rest in zip(*columns, strict=True) if rest[0] > 0]
     return rows[:: max(1, (len(rows) - 1) // 2)][:3]
 
 
@@ -238,10 +228,12 @@ def vehicle_colour(name: str, number: int) -> str:
     return rendering.ROLE_COLOURS.get(name, rendering.OTHER_COLOURS[number % len(rendering.OTHER_COLOURS)])
 
 
-def choose_moments(drive: Drive) -> list[int]:
-    """Return `MOMENTS` moments, spread over the last seconds up to the worst one."""
+def draw_moments(figure: Figure, drive: Drive) -> None:
+    """Draw `MOMENTS` moments of a drive, spread over the last seconds up to the worst one."""
     first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
-    return [int(t) for t in np.linspace(first, drive.worst, MOMENTS).round()]
+    moments = np.linspace(first, drive.worst, MOMENTS).round().astype(int).tolist()
+    for axes, t in zip(figure.subplots(MOMENTS, 1), moments, strict=True):
+        draw_moment(axes, drive, t)
 
 
 def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
@@ -318,23 +310,15 @@ FRACTION_BELOW = 0.1
 """Left end of the axis over the smallest number on it, where an interval reaches down to 0."""
 
 
-class RateRow(NamedTuple):
-    """Collisions per million km in one kind of event, beside people's."""
-
-    name: str
-    rate: float
-    interval: RateInterval
-    people: HumanBenchmark | None
-    model: float = 0.0
-    """Of the human driver model."""
+RateRow = tuple[str, CollisionRate | TotalRate, HumanBenchmark | None, float]
+"""Name of a kind of event, collisions per million km in it, people's, and those of the human driver model."""
 
 
 def _make_row(each: EventRate) -> RateRow:
     """Return the row of an event, with whether its rate is calibrated."""
     name, known = EVENT_NOUNS.get(each.event, each.event), each.calibration
     name = f"{name}\n({'no calibration' if known is None else 'not calibrated'})" if each.uncalibrated else name
-    model = 0.0 if known is None else known.per_million_km().p
-    return RateRow(name, each.rate.per_million_km, each.rate.interval_per_million_km, each.people, model)
+    return name, each.rate, each.people, 0.0 if known is None else known.per_million_km().p
 
 
 def save_risk_plot(
@@ -342,7 +326,7 @@ def save_risk_plot(
 ) -> None:
     """Draw the rates of events and their sum beside those of people, and save it."""
     level, ends = f"{100 * total.confidence:g} %: ", total.interval_per_million_km
-    rows = [_make_row(each) for each in events] + [RateRow("all of these", total.per_million_km, ends, people)]
+    rows = [*map(_make_row, events), ("all of these", total, people, 0.0)]
     with saved_figure(path, 1.8 + 0.75 * len(rows), 7.0) as figure:
         said = format_with_interval(total.per_million_km, ends, " collisions per million km", level)
         figure.suptitle(f"{ego}\n{said}", fontweight="bold")
@@ -351,17 +335,16 @@ def save_risk_plot(
 
 def draw_rates(axes: Axes, rows: Sequence[RateRow]) -> None:
     """Draw rates with intervals, below each that of people, and the human driver model as far as it was measured."""
-    pairs = [each.interval for each in rows]
-    pairs += [each.people.interval_per_million_km for each in rows if each.people is not None]
-    ends = [end for pair in pairs for end in pair if end > 0]
+    known = [each for _, rate, people, _ in rows for each in (rate, people) if each is not None]
+    ends = [end for each in known for end in each.interval_per_million_km if end > 0]
     start = FRACTION_BELOW * min(ends)
-    for place, each in enumerate(rows):
-        _draw_interval(axes, place - 0.15, each.rate, each.interval, LINE_COLOUR, start)
-        if each.people is not None:
-            beside = each.people.per_million_km, each.people.interval_per_million_km
-            _draw_interval(axes, place + 0.15, *beside, ORDINARY_COLOUR, start)
-        if each.model > start:
-            axes.plot(each.model, place + 0.15, "D", color=MODEL_COLOUR, markersize=6)
+    for place, (_, rate, people, model) in enumerate(rows):
+        for each, below, colour in ((rate, -0.15, LINE_COLOUR), (people, 0.15, ORDINARY_COLOUR)):
+            if each is not None:
+                beside = each.per_million_km, each.interval_per_million_km
+                _draw_interval(axes, place + below, *beside, colour, start)
+        if model > start:
+            axes.plot(model, place + 0.15, "D", color=MODEL_COLOUR, markersize=6)
     for marker, colour, words in (
         ("o-", LINE_COLOUR, "the ego"),
         ("o-", ORDINARY_COLOUR, "people in the same event"),
@@ -369,7 +352,7 @@ def draw_rates(axes: Axes, rows: Sequence[RateRow]) -> None:
     ):
         axes.plot([], [], marker, color=colour, linewidth=4, label=words)
     axes.set(xscale="log", xlim=(start, max(ends) / FRACTION_BELOW), ylim=(len(rows) - 0.4, -0.6))
-    axes.set_yticks(range(len(rows)), [each.name for each in rows])
+    axes.set_yticks(range(len(rows)), [name for name, *_ in rows])
     axes.xaxis.set_major_locator(LogLocator(numticks=7))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda rate, _: f"{rate:,.10g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())

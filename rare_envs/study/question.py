@@ -34,7 +34,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.needs import EgoWarning
 from rare_envs.egos.policy import split_drivers
-from rare_envs.files import digest_file, open_ordinary, parse_json_object, read_text_file
+from rare_envs.files import digest_file, open_ordinary, read_json
 from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import EgoGone, names_object, split_settings
 from rare_envs.problem import DrivingProblem
@@ -298,7 +298,7 @@ def warn_of_changed_files(question: Question, folder: Path) -> None:
 def read_about(folder: Path) -> dict[str, Any]:
     """Return what study.json holds; nothing where it cannot be read, which others tell."""
     try:
-        return parse_json_object(read_text_file(folder / STUDY), STUDY)
+        return read_json(folder / STUDY)
     except (OSError, ValueError):
         return {}
 

@@ -21,7 +21,7 @@ from rare_envs.files import (
     digest_file,
     open_ordinary,
     open_parquet,
-    parse_json_object,
+    read_json,
     read_members,
     read_text_file,
 )
@@ -286,13 +286,13 @@ def load_study(folder: str | Path) -> LoadedStudy:
             f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out "
             f"writes, but {_say_what_is_there(path)}."
         )
-    about = _read_object(path / STUDY) if (path / STUDY).exists() else {}
+    about = read_object(path / STUDY) if (path / STUDY).exists() else {}
     if about.get("format") != STUDY_FORMAT and (path / STUDY).exists():
         raise BadInput(
             f"Expected format {STUDY_FORMAT} in {str(path / STUDY)!r}, got {reprlib.repr(about.get('format'))}: "
             "the file is damaged, or of a newer version of rare-envs. Without it the run can be read."
         )
-    result = _read_object(path / RESULT)
+    result = read_object(path / RESULT)
     interval = result.get("interval")
     numbers = [result.get("p"), *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
     if not all(type(value) in (int, float) and 0.0 <= value < math.inf for value in numbers):
@@ -328,7 +328,7 @@ def _say_what_is_there(path: Path) -> str:
     return f"it has {', '.join(names[:MOST_NAMED])}{more}" if names else "it is empty"
 
 
-def _read_object(path: Path) -> dict[str, Any]:
-    """Return the object of a JSON file."""
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file, or raise a BadInput."""
     with as_bad_input(OSError, ValueError):
-        return parse_json_object(read_text_file(path), repr(str(path)))
+        return read_json(path)

@@ -9,6 +9,7 @@ import re
 import shlex
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
 from rare_envs.envs.rendering import CRASH_COLOUR, ROLE_COLOURS
-from rare_envs.files import parse_json_object, read_text_file, replace_text
+from rare_envs.files import replace_text
 from rare_envs.people import CALIBRATED_WITHIN
 from rare_envs.plugins import EgoGone, clean_text, one_line, reason_of
 from rare_envs.problem import DrivingProblem
@@ -43,6 +44,7 @@ from rare_envs.study.run_folder import (
     LoadedStudy,
     load_finished,
     read_failures,
+    read_object,
 )
 from samplers.output import unfold_rows
 from samplers.problem import FloatArray
@@ -130,18 +132,14 @@ def draw_shown(problem: DrivingProblem) -> FloatArray:
 def build_atlas(
     study: LoadedStudy, problem: DrivingProblem, events: FloatArray | None, prefix: str = "", share: float = 1.0
 ) -> list[AtlasEntry]:
-    """Return the entries of all modes, the large ones with pictures.
+    """Return the entries of all modes, the large ones with pictures, beside recorded events (m, k) if there are any.
 
-    Args:
-        study: The run.
-        problem: What it is about.
-        events: Recorded ones (m, k), if there are any.
-        prefix: Of the names of figures.
-        share: The run's share of what the page is about.
+    `prefix` stands before the names of figures; `share` is that of the run in what the page is about.
     """
-    modes, found = list(study.result.get("modes") or []), list[AtlasEntry]()
-    for number, mode in enumerate(modes):
-        failure, others = mode.get("failure"), {name: _say_other(study, mode, name) for name in _list_others(study)}
+    driven = [name for name in study.result.get("other_drivers") or {} if name != study.question.get("ego")]
+    found = list[AtlasEntry]()
+    for number, mode in enumerate(study.result.get("modes") or []):
+        failure, others = mode.get("failure"), {name: _say_other(study, mode, name) for name in driven}
         entry = AtlasEntry(mode, others)
         large = share * mode["of_failures"] >= LEAST_SHOWN or (number == 0 and share == 1.0)
         if failure is None and large:
@@ -154,11 +152,6 @@ def build_atlas(
             entry = entry._replace(f=float(study.failures["f"][int(failure)]), x=x, nearest=nearest, shown=shown)
         found.append(entry)
     return found
-
-
-def _list_others(study: LoadedStudy) -> list[str]:
-    """Return the names of other drivers that were put in the ego's place."""
-    return [name for name in study.result.get("other_drivers") or {} if name != study.question.get("ego")]
 
 
 def _say_other(study: LoadedStudy, mode: Mapping[str, Any], name: str) -> str:
@@ -181,23 +174,20 @@ def _show_drive(problem: DrivingProblem, x: FloatArray, name: str) -> Shown:
 def _draw_drive(drive: Drive, name: str) -> list[FigureOfPage]:
     """Return the figures of a drive: from above, the measure, and speeds."""
 
-    def draw_views(figure: Figure) -> None:
-        for axes, t in zip(figure.subplots(plots.MOMENTS, 1), plots.choose_moments(drive), strict=True):
-            plots.draw_moment(axes, drive, t)
-
     def draw_measure(figure: Figure) -> None:
         axes = figure.subplots()
         plots.draw_measure(axes, drive)
         axes.legend(loc="upper right", frameon=False)
 
-    def draw_speeds(figure: Figure) -> None:
-        plots.draw_speeds(figure.subplots(), drive)
-
     height = 0.25 + plots.MOMENTS * max(0.45, 0.03 * drive.road.lanes * drive.road.width)
     return [
-        FigureOfPage(f"{name}-views", "From above; the ego is green", draw_views, (4.2, height)),
+        FigureOfPage(
+            f"{name}-views", "From above; the ego is green", partial(plots.draw_moments, drive=drive), (4.2, height)
+        ),
         FigureOfPage(f"{name}-measure", "The measure over time", draw_measure, (4.2, 2.2)),
-        FigureOfPage(f"{name}-speeds", "Speeds over time", draw_speeds, (4.2, 2.6)),
+        FigureOfPage(
+            f"{name}-speeds", "Speeds over time", lambda figure: plots.draw_speeds(figure.subplots(), drive), (4.2, 2.6)
+        ),
     ]
 
 
@@ -337,8 +327,8 @@ def _describe_run(
 
 def _describe_risk(folder: Path, trust: bool) -> dict[str, Any]:
     """Return what the page says of a risk: its sum, and all that it says of each scenario."""
-    with as_bad_input(OSError, ValueError), _damage_as_bad_input(folder):
-        total = parse_json_object(read_text_file(folder / RISK), RISK)
+    total = read_object(folder / RISK)
+    with _damage_as_bad_input(folder):
         rates = {name: float(each["per_million_km"]) for name, each in total["scenarios"].items()}
         whole, lines = sum(rates.values()), [str(line) for line in total["text"]]
         last = max(k for k, line in enumerate(lines) if line.startswith("all "))
@@ -367,18 +357,16 @@ def _describe_risk(folder: Path, trust: bool) -> dict[str, Any]:
 
 def _describe_comparison(folder: Path, trust: bool) -> dict[str, Any]:
     """Return what the page says of a comparison in one scenario, or of one that is summed over several."""
-    with as_bad_input(OSError, ValueError):
-        found = parse_json_object(read_text_file(folder / COMPARISON), COMPARISON)
+    found = read_object(folder / COMPARISON)
     with _damage_as_bad_input(folder):
         if "question" in found:
             pair = _describe_pair(folder, found, trust)
             return {**pair, "runs": {"": pair}}
         names = [str(name) for name in found["scenarios"]]
-    runs = {}
-    for name in names:
-        with as_bad_input(OSError, ValueError):
-            part = parse_json_object(read_text_file(folder / name / COMPARISON), COMPARISON)
-        runs[name] = _describe_pair(folder / name, part, trust, f"{name}-")
+    parts = {name: folder / name for name in names}
+    runs = {
+        name: _describe_pair(part, read_object(part / COMPARISON), trust, f"{name}-") for name, part in parts.items()
+    }
     with _damage_as_bad_input(folder):
         return {
             "title": f"{found['ego_a']} (A) against {found['ego_b']} (B)",

@@ -110,7 +110,7 @@ def test_the_folder_of_a_run_holds_what_was_printed_and_a_picture(cli: Cli, risk
         green = (picture[..., 1] > picture[..., 0] + 0.1) & (picture[..., 1] > picture[..., 2] + 0.1)
         assert green.mean() > 0.001 or name == "failures.png"
     severity = json.loads(result.stdout)["severity"]
-    assert list_severity(severity)[0].km_h == 0.0 and len(list_severity(severity)) == 3
+    assert list_severity(severity)[0][0] == 0.0 and len(list_severity(severity)) == 3
 
 
 def test_where_nobody_closes_in_the_curve_has_a_gap_and_not_the_cap() -> None:
