@@ -136,7 +136,7 @@ def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
         action, hidden = policy.predict(
             query.observation, state=query.hidden, episode_start=query.start, deterministic=True
         )
-    actions = np.asarray(action)
+    actions = np.asarray(action, order="C")  # torch takes no view with a negative stride
     if actions.dtype.kind not in "biuf":
         raise ValueError(f"Expected actions as numbers, one or two for each observation, got {reprlib.repr(action)}.")
     return torch.as_tensor(actions), hidden

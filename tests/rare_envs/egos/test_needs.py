@@ -91,6 +91,11 @@ def test_several_or_none_are_refused_in_a_line() -> None:
         assert "\n" not in str(refused.value)
 
 
+def test_actions_may_be_a_view_backwards() -> None:
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=lambda seen: np.zeros((len(seen), 2))[::-1])
+    assert np.isfinite(problem.evaluate(problem.base.sample(2, np.random.default_rng(0)))).all()
+
+
 @pytest.mark.parametrize("space", [spaces.Discrete(7), spaces.Discrete(5, start=1)])
 def test_other_numbers_than_0_to_4_are_refused(space: spaces.Discrete) -> None:
     with pytest.raises(ValueError, match=r"^The ego acts in Discrete\(.*or Discrete\(5\); put an object"):
