@@ -133,9 +133,10 @@ def query_policy(
 
 def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
     with np.errstate(), as_errors():  # a policy that sets NumPy's errors sets them for itself
-        action, hidden = policy.predict(
-            query.observation, state=query.hidden, episode_start=query.start, deterministic=True
-        )
+        given = policy.predict(query.observation, state=query.hidden, episode_start=query.start, deterministic=True)
+    if not (isinstance(given, tuple | list) and len(given) == 2):
+        raise ValueError(f"Expected predict to return actions and memory (None without), got {type(given).__name__}.")
+    action, hidden = given
     actions = np.asarray(action, order="C")  # torch takes no view with a negative stride
     if actions.dtype.kind not in "biuf":
         raise ValueError(f"Expected actions as numbers, one or two for each observation, got {reprlib.repr(action)}.")

@@ -140,6 +140,8 @@ def test_a_predict_of_the_observation_alone_is_refused_before_anything_is_simula
         ValueError, match=r"state, episode_start, deterministic\), as .*, got predict\(observation.* of Short"
     ):
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Short())
+    with pytest.raises(ValueError, match=r"^Expected predict to return actions and memory \(.*\), got ndarray\.$"):
+        query_policy(Still(), "continuous", query(-0.2))
 
 
 @pytest.mark.parametrize(
