@@ -20,6 +20,7 @@ from rare_envs.study import BadInput, Question, prepare, run, run_into, writing
 from rare_envs.study.html_report import write_html_report
 from rare_envs.study.report import Report, judge_rate
 from rare_envs.study.run_folder import JOURNAL
+from rare_envs.study.text import report_as_json
 from tests.rare_envs.study.fitted_files import write_fitted, write_stratified
 from tests.rare_envs.study.refusals import Cli, act_after, assert_refused, in_file
 
@@ -198,7 +199,7 @@ def test_limits_are_compared_with_the_one_sided_ends_of_the_sum(brakings: str) -
     ):
         for limit, decision in ((1.001 * high, "passes"), (0.999 * low, "fails"), ((low * high) ** 0.5, "undecided")):
             found = judge(**{name: limit})
-            assert found.verdict.decision == decision == found.to_dict()["gate"]["decision"]
+            assert found.verdict.decision == decision == report_as_json(found)["gate"]["decision"]
     assert str(found.verdict).startswith("undecided: collisions per million km ")
     assert f", limit {limit:g}; " in str(found.verdict)
     given = judge(max_rate=limit, assume_traffic=True).verdict
