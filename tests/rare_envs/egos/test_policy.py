@@ -192,3 +192,10 @@ def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() ->
         np.testing.assert_array_equal(shown, first)
         shown, _ = policy.predict(two, state, episode_start=np.array([False, True]))  # the second row begins anew
         np.testing.assert_array_equal(shown, second)
+
+
+def test_a_batch_of_a_policy_with_a_memory_is_not_split() -> None:
+    ego = Recorder(predict=lambda seen, state, **_: (np.zeros((1 // (len(seen) == 1 and not state), 2)), "kept"))
+    for hidden in (None, "kept"):
+        with pytest.raises(ZeroDivisionError):
+            query_policy(ego, "continuous", PolicyQuery(np.eye(2), hidden, np.ones(2, bool), torch.zeros(2) > 0), {})
