@@ -17,7 +17,7 @@ LIMITS = {
     "functions": 3_215,
     "classes": 472,
     "import lines, percent of code": 10.5,
-    "test lines": 33_770,
+    "test lines": 33_830,
     "pages": 18,
     "words of pages": 37_180,
     "files entered by an estimate": 43,

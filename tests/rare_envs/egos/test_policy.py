@@ -11,7 +11,7 @@ import rare_envs
 from rare_envs.control.actions import IDLE
 from rare_envs.egos.policy import PolicyQuery, as_driver, check_spaces, query_policy
 from rare_envs.egos.wrappers import WrappedPolicy, find_frame_stacking
-from rare_envs.plugins import NoAnswer, check_predict, refuse_ego
+from rare_envs.plugins import EgoGone, NoAnswer, check_predict, refuse_ego
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.settings import Clock
@@ -74,29 +74,60 @@ def test_a_policy_with_meta_actions_is_queried_once_a_second() -> None:
     assert len(policy.shown) == 2
 
 
-class Lost:
-    """A policy whose first answers are lost; then it accelerates as it observes."""
+class Picky:
+    """A policy that accelerates as it observes, and fails on negative observations."""
 
-    def __init__(self, times: int) -> None:
-        self.times = times
+    def __init__(self, error: BaseException | None = None, memory: Any = None, times: int = 10**9) -> None:
+        self.error, self.memory, self.times = error, memory, times
+        self.sizes: list[int] = []
 
-    def predict(self, observation: Any, **_: Any) -> Any:
-        self.times -= 1
-        if self.times >= 0:
-            raise NoAnswer("lost")
-        return np.concatenate((observation, 0.0 * observation), axis=1), None
+    def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
+        assert deterministic
+        self.sizes.append(len(observation))
+        if self.error is not None and (observation < 0.0).any() and self.times:
+            self.times -= 1
+            raise self.error
+        return np.concatenate((observation, 0.0 * observation), axis=1), self.memory
 
 
-def query(*values: float) -> PolicyQuery:
+def query(values: list[float], hidden: Any = None, over: tuple[int, ...] = ()) -> PolicyQuery:
     n = len(values)
-    return PolicyQuery(np.array(values)[:, None], None, np.ones(n, bool), torch.zeros(n, dtype=torch.bool))
+    rows = torch.tensor([row in over for row in range(n)])
+    return PolicyQuery(np.array(values)[:, None], hidden, np.full(n, hidden is None), rows)
+
+
+def test_failing_rows_get_a_reason_and_no_action() -> None:
+    failed: dict[int, str] = {}
+    policy = Picky(RuntimeError("no road"))
+    action, _ = query_policy(policy, "continuous", query([0.2, -1.0, 0.4, 0.6]), failed)
+    torch.testing.assert_close(action[:, 0], torch.tensor([1.0, 0.0, 2.0, 3.0]))
+    assert failed == {1: "RuntimeError: no road"}
+    assert policy.sizes == [4, 2, 1, 1, 2]
+
+
+def test_actions_that_are_not_finite_cost_their_row_alone() -> None:
+    failed: dict[int, str] = {}
+    policy = Picky()
+    action, _ = query_policy(policy, "continuous", query([np.nan, 0.4, np.nan], over=(2,)), failed)
+    torch.testing.assert_close(action[:, 0], torch.tensor([0.0, 2.0, 0.0]))
+    assert failed == {0: "NaN or infinite actions"}
+    assert policy.sizes == [3]
 
 
 def test_who_does_not_answer_is_queried_once_more() -> None:
-    action, _ = query_policy(Lost(1), "continuous", query(-0.2))
+    action, _ = query_policy(Picky(NoAnswer("lost"), times=1), "continuous", query([-0.2]))
     assert float(action[0, 0]) == pytest.approx(-1.0)
     with pytest.raises(NoAnswer):
-        query_policy(Lost(2), "continuous", query(-0.2))
+        query_policy(Picky(NoAnswer("lost"), times=2), "continuous", query([-0.2]))
+
+
+@pytest.mark.parametrize("hidden", [None, "kept"])
+def test_a_batch_of_a_policy_with_a_memory_is_not_split(hidden: Any) -> None:
+    failed: dict[int, str] = {}
+    for error in (RuntimeError, EgoGone):  # one that is gone is gone
+        with pytest.raises(error, match="no road"):
+            query_policy(Picky(error("no road"), memory="kept"), "continuous", query([0.1, -1.0], hidden), failed)
+    assert failed == {}
 
 
 def test_a_failed_row_idles_where_actions_are_meta() -> None:
@@ -107,9 +138,19 @@ def test_a_failed_row_idles_where_actions_are_meta() -> None:
             return observation[:, 0].astype(int), None
 
     failed: dict[int, str] = {}
-    action, _ = query_policy(Meta(), "meta", query(3.0, -1.0, 4.0), failed)
+    action, _ = query_policy(Meta(), "meta", query([3.0, -1.0, 4.0]), failed)
     assert action.tolist() == [3, IDLE, 4]
     assert list(failed) == [1]
+
+
+@pytest.mark.parametrize("answer", ["left", ["left", "left"], [None, None], [{"steering": 0.0}] * 2])
+def test_actions_that_are_no_numbers_are_refused(answer: Any) -> None:
+    class Wordy:
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return answer, None
+
+    with pytest.raises(ValueError, match="Expected actions as numbers, one or two for each observation, got"):
+        query_policy(Wordy(), "continuous", query([0.1, 0.2]))
 
 
 class Still:
@@ -141,7 +182,7 @@ def test_a_predict_of_the_observation_alone_is_refused_before_anything_is_simula
     ):
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Short())
     with pytest.raises(ValueError, match=r"^Expected predict to return actions and memory \(.*\), got ndarray\.$"):
-        query_policy(Still(), "continuous", query(-0.2))
+        query_policy(Still(), "continuous", query([-0.2]))
 
 
 @pytest.mark.parametrize(
@@ -192,10 +233,3 @@ def test_frames_side_by_side_begin_with_zeros_and_along_an_axis_with_copies() ->
         np.testing.assert_array_equal(shown, first)
         shown, _ = policy.predict(two, state, episode_start=np.array([False, True]))  # the second row begins anew
         np.testing.assert_array_equal(shown, second)
-
-
-def test_a_batch_of_a_policy_with_a_memory_is_not_split() -> None:
-    ego = Recorder(predict=lambda seen, state, **_: (np.zeros((1 // (len(seen) == 1 and not state), 2)), "kept"))
-    for hidden in (None, "kept"):
-        with pytest.raises(ZeroDivisionError):
-            query_policy(ego, "continuous", PolicyQuery(np.eye(2), hidden, np.ones(2, bool), torch.zeros(2) > 0), {})
