@@ -72,7 +72,7 @@ _DQN |= {"exploration_fraction": 0.3, "exploration_final_eps": 0.02}
 _NETS = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02, num_envs=384),
+        "ppo": Hyperparameters(_PPO, _PPO_POLICY, reward_scale=0.02, num_envs=320),
         "a2c": Hyperparameters(_A2C, _ACTOR_CRITIC),
         "sac": Hyperparameters(_SAC, _NETS),
         "td3": Hyperparameters(_TD3, _NETS, noise=0.2),
@@ -163,7 +163,7 @@ def train_ego(
         algo: One of `HYPERPARAMETERS`: "ppo", "a2c", "sac", "td3", "dqn".
         steps: Environment steps, summed over the batch; rounded up to whole rollouts.
         seed: Seed of the networks, the exploration and the scenarios.
-        num_envs: Episodes that run side by side; by default 384 with PPO and 256 with the others.
+        num_envs: Episodes that run side by side; by default 320 with PPO and 256 with the others.
         out: The `.zip` to write; missing folders are made, a missing suffix is added.
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.

@@ -52,7 +52,7 @@ def train_ego_command(
         int, Option(help="Environment steps to train for.", parser=read_count, metavar="INTEGER")
     ] = 200_000,
     out: Annotated[Path, Option(help="File to save the policy in.")] = Path("ego.zip"),
-    num_envs: Annotated[int | None, Option(help="Parallel episodes; by default 384 with ppo, else 256.")] = None,
+    num_envs: Annotated[int | None, Option(help="Parallel episodes; by default 320 with ppo, else 256.")] = None,
     device: Annotated[str, Option(help="Device that simulates and trains: cpu, or a GPU (cuda, cuda:1).")] = "cpu",
     resume: Annotated[bool, Option("--resume", help="Continue an interrupted training.")] = False,
     force: ForceOption = False,
