@@ -405,6 +405,9 @@ def report_as_json(report: Report, top: int = 10) -> dict[str, Any]:
     def name_values(x: FloatArray) -> dict[str, Any]:
         return {name: np.asarray(value).tolist() for name, value in space.named(x).items()}
 
+    def name_others(*kind: str) -> dict[str, Any]:
+        return {name: each._asdict() for name, each in kinds.find_others(*kind).items()}
+
     return {
         **report.estimate.to_dict(),
         "question": asdict(report.study.question),
@@ -420,25 +423,17 @@ def report_as_json(report: Report, top: int = 10) -> dict[str, Any]:
         "earlier_seconds": report.earlier_seconds,
         "n_failures": failures.total,
         "kinds": {
-            kind: {
-                **share.to_dict(),
-                "other_drivers": {n: each._asdict() for n, each in kinds.find_others(kind).items()},
-            }
-            for kind, share in kinds.shares.items()
+            kind: {**share.to_dict(), "other_drivers": name_others(kind)} for kind, share in kinds.shares.items()
         },
-        "other_drivers": {name: each._asdict() for name, each in kinds.find_others().items()},
+        "other_drivers": name_others(),
         "n_other_drivers": kinds.n_others,
         "modes": [mode.to_dict() for mode in kinds.modes],
         "curve": convert(report.curve),
         "severity": convert(kinds.severity),
         "sensitivity": None if isinstance(report.sensitivity, str) else convert(report.sensitivity),
         "failures": [
-            {
-                "parameters": name_values(one.x),
-                "f": one.f if math.isfinite(one.f) else None,
-                "log_p0": one.log_p0,
-                "crash": crash,
-            }
+            {"parameters": name_values(one.x), "f": one.f if math.isfinite(one.f) else None}
+            | {"log_p0": one.log_p0, "crash": crash}
             for one, crash in listed
         ],
         "n_faults": len(report.faults),
